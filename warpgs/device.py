@@ -220,9 +220,10 @@ CGROUPS = Path("/sys/fs/cgroup")
 
 NO_MEMORY = (
     "out of memory", "can't allocate memory", "cannot allocate memory", "not enough memory", "insufficient memory",
-    "failed to allocate", "bad_alloc", "bad allocation", "unable to allocate",
+    "failed to allocate", "bad_alloc", "bad allocation", "unable to allocate", "failed to map segment", "start new thread",
 )  # fmt: skip
-"""Parts of the messages of torch, Warp, OpenCV, ONNX Runtime, numpy and C++ on lack of memory, in lower case."""
+"""Parts of the messages of torch, Warp, OpenCV, ONNX Runtime, numpy, C++ and the system on limits of memory and threads, in
+lower case."""
 
 
 Memory = tuple[int, int]
@@ -256,26 +257,13 @@ def is_out_of_memory(error: BaseException) -> bool:
     return False
 
 
-def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
-    """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True."""
-    remedy = "End other programs, and try again"
-    if fitting:
-        remedy = "Give --memory-limit or --downscale, or end other programs; --resume continues from the last checkpoint"
+def no_memory_message(error: BaseException, purpose: str = "") -> str:
+    """Return the message for a lack of memory, with remedies."""
+    remedy = (
+        "End other programs, or raise the limits that `ulimit -a` shows; a fit needs less with --memory-limit or --downscale"
+    )
     reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
-    return f"out of memory{purpose} ({reason[:200]}). {remedy}"
-
-
-LIMITS = {
-    "failed to map segment": "a library cannot be loaded: raise the limit of memory (`ulimit -v`), end other programs, or "
-    "install warpgs on a disk that is not mounted noexec",
-    "can't start new thread": "too many threads: end other programs, or raise the limit of processes (`ulimit -u`)",
-}
-"""Remedies for limits of the system, by a part of the error."""
-
-
-def exhausted_limit(error: BaseException) -> str:
-    """Return the message for a limit of the system that an error reports; empty for other errors."""
-    return next((f"{remedy} ({str(error)[:200]})" for part, remedy in LIMITS.items() if part in str(error)), "")
+    return f"out of memory{purpose} ({reason[:200]}). {remedy}, and --resume continues from its last checkpoint"
 
 
 @functools.cache
@@ -369,30 +357,20 @@ def prepare_kernel_cache() -> tuple[Path, str]:
 
 def choose_kernel_cache(configured: str | None = None) -> tuple[Path, str]:
     """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable."""
-    folder, refused = _usual(configured)
-    if folder is not None:
-        if not (refused := _fault(folder)):
-            return folder, ""
+    folder, refused = None, "no home folder for a kernel cache"
+    if asked := configured or os.environ.get("WARP_CACHE_PATH"):
+        folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
+        folder = None if asked.startswith("~") and not folder.is_absolute() else folder
+    elif (home := cache_home()) is not None:  # where Warp's appdirs would put it; Warp adds its version
+        folder = home.joinpath(*(("NVIDIA", "warp", "Cache") if sys.platform == "win32" else ("warp",)))
+    if folder and not (refused := _fault(folder := folder.resolve())):
+        return folder, ""
     try:
         own = private_folder() / "kernels"
         own.mkdir(exist_ok=True)
         return own, refused
     except (ResourceError, OSError) as e:
         raise ResourceError(f"no folder for compiled kernels can be written: {refused}, and {e}. {REMEDY}") from e
-
-
-def _usual(configured: str | None) -> tuple[Path | None, str]:
-    """Return the requested folder or Warp's default; or None, and the reason."""
-    asked = configured or os.environ.get("WARP_CACHE_PATH")
-    if asked:
-        folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
-        if asked.startswith("~") and not folder.is_absolute():
-            return None, f"the kernel cache {asked} is in an unknown home folder"
-        return folder.resolve(), ""
-    if (home := cache_home()) is None:
-        return None, "no home folder for a kernel cache"
-    # where Warp's appdirs would put it; Warp adds its version
-    return home.joinpath(*(("NVIDIA", "warp", "Cache") if sys.platform == "win32" else ("warp",))).resolve(), ""
 
 
 def _fault(folder: Path) -> str:

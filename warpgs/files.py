@@ -111,7 +111,7 @@ MAX_HEADER_BYTES = 65536
 def ply_header(head: bytes) -> tuple[list[PlyElement], int, bool]:
     """Return the elements of the header in a PLY file's first bytes, the offset [bytes] of the data, and if they are ASCII."""
     expect(re.match(rb"ply[ \t]*\r?\n", head), "it does not start with 'ply'")
-    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
+    end: Any = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
     expect(end, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
     elements: list[PlyElement] = []
     formats = []
@@ -176,9 +176,12 @@ def read_tensors(path: Path, fix: str, again: str) -> tuple[dict[str, Any], dict
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:
-    """Return the SHA-256 of a regular file, hexadecimal; ``below`` as in `open_input`."""
-    with open_input(path, below) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the SHA-256 of a regular file, hexadecimal, or raise DataError; ``below`` as in `open_input`."""
+    try:
+        with open_input(path, below) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
 
 
 def unread_reason(error: Exception) -> str:

@@ -180,10 +180,8 @@ def _interruptible(call: Callable[[], T], cancel: Callable[[], object]) -> T:
 
 def start_session(data: bytes, path: Path, provider: str, threads: int) -> Any:
     """Return an `InferenceSession` for the bytes of a checked ONNX file."""
-    try:
-        import onnxruntime as ort
-    except ImportError as e:
-        raise ResourceError(f"{path}: onnxruntime is needed, and cannot be imported ({e}); `pip install onnxruntime`") from e
+    import onnxruntime as ort
+
     there = [name for name, long in PROVIDERS.items() if long in ort.get_available_providers()]
     remedy = "`pip uninstall onnxruntime`, then `pip install onnxruntime-gpu[cuda,cudnn]`; or leave the flag out"
     if provider not in there:

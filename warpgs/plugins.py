@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from warpgs.errors import UsageError, WarpgsError
+from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.files import input_digest
 
 
@@ -152,14 +152,10 @@ def load_object(kind: str, spec: str) -> object:
 
 def own_code(classes: Iterable[type]) -> dict[str, str]:
     """Return the SHA-256 of the source file of each class from outside warpgs, by its registered name."""
-    digests = {str(getattr(c, "name", c.__qualname__)): _digest(c) for c in classes if not is_ours(c)}
+    digests = {
+        str(getattr(c, "name", c.__qualname__)): module_digest(sys.modules.get(c.__module__)) for c in classes if not is_ours(c)
+    }
     return {name: digest for name, digest in sorted(digests.items()) if digest}
-
-
-@functools.cache
-def _digest(cls: type) -> str:
-    """Return the SHA-256 of a class's file, read at the first call because it may be edited later; empty without a file."""
-    return module_digest(sys.modules.get(cls.__module__))
 
 
 def own_places(classes: Iterable[type]) -> list[str]:
@@ -169,12 +165,13 @@ def own_places(classes: Iterable[type]) -> list[str]:
     return sorted(str(place) for place in files.values() if place)
 
 
+@functools.cache
 def module_digest(module: ModuleType | None) -> str:
-    """Return the SHA-256 of the file of a module; empty without one."""
+    """Return the SHA-256 of the file of a module, read at the first call because it may be edited later; empty without one."""
     path = getattr(module, "__file__", None)
     try:
         return input_digest(path) if path else ""
-    except OSError:  # a module of an archive, or one that is gone since
+    except DataError:  # a module of an archive, or one that is gone since
         return ""
 
 

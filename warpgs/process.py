@@ -259,14 +259,9 @@ def _flush(*numbers: int) -> None:
 # Python opens such files. Libraries that expect UTF-8 fail on such names, and some end the process.
 
 
-def is_utf8(text: str) -> bool:
-    """Return whether text can be written as UTF-8."""
-    return readable(text) == text
-
-
 def utf8_name(path: Path) -> str:
     """Return the name of a file or folder for a library that needs UTF-8."""
-    if not is_utf8(str(path)):
+    if readable(str(path)) != str(path):
         raise UsageError(f"{readable(str(path))}: the name is not UTF-8, which is needed here; rename the file or its folder")
     return str(path)
 

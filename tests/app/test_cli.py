@@ -132,7 +132,7 @@ def test_render_paths(run, tmp_path, path, pictures, capsys, monkeypatch):
     assert len(list(tmp_path.glob("*.png"))) == pictures + 1 and (tmp_path / "film.mp4").stat().st_size > 0
     said = capsys.readouterr().out
     assert said.startswith("the film will be VP9, ") and said.count("install ffmpeg") == 1
-    assert f"rendering {pictures} frames\nrendering: 2 of {pictures} frames, " in said
+    assert f"rendering: 0 of {pictures} frames\n" in said
     assert f"sheet of {min(6, pictures)} frames in {tmp_path / 'sheet.png'}" in said
     if path == "spiral":  # the advice is not repeated, except for a film that shall be .mp4
         for out, times in ((tmp_path, 0), (tmp_path / "a.webp", 0), (tmp_path / "a.mp4", 1), (tmp_path / "a.mp4", 1)):
@@ -278,7 +278,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
         ("plot RUN --size 720", "--size: write it as --size 1080 1920;"),
         ("level RUN --scale 0,0,0 1,0,0", "--scale: write it as --scale a.jpg:41,22 b.jpg:95,31 1.2;"),
         ("render --portrait RUN", "unknown flag --portrait; `warpgs render --help-all` lists the flags"),
-        ("export RUN --to page.htm", "page.htm: format .htm is not supported; did you mean page.html?"),
+        ("export RUN --to page.htm", "page.htm: format .htm is not supported; use one of"),
         ("view scene.html", "scene.html: is a web page; open this file in a browser"),
     ],
 )
@@ -311,10 +311,9 @@ CPU_FULL = "[enforce fail at alloc_cpu.cpp:127] . DefaultCPUAllocator: can't all
 NO_MEMORY = [
     RuntimeError(CUDA_FULL), MemoryError(), RuntimeError(CPU_FULL), RuntimeError("std::bad_alloc"), OSError(errno.ENOMEM, "no"),
     RuntimeError("OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 9 bytes"),
-    RuntimeError("Failed to allocate 9 bytes on device 'cpu'"),
+    RuntimeError("Failed to allocate 9 bytes on device 'cpu'"), RuntimeError("can't start new thread"),
+    ImportError("libx.so: failed to map segment from shared object"),
 ]  # fmt: skip
-LIBRARY = ImportError("libx.so: failed to map segment from shared object")
-THREADS = RuntimeError("can't start new thread")
 
 
 @pytest.mark.parametrize("ask", [lambda: torch.empty(2**60), lambda: np.zeros((2**30, 2**24))])
@@ -348,19 +347,14 @@ def test_numbers_at_their_extremes(tmp_path, capsys, monkeypatch, command, flag)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
-@pytest.mark.parametrize("error", [*NO_MEMORY, LIBRARY, THREADS], ids=lambda e: str(e)[-20:])
+@pytest.mark.parametrize("error", NO_MEMORY, ids=lambda e: str(e)[-20:])
 def test_limits_of_the_system_are_no_defects(error, capsys, monkeypatch):
     def full(*_):
         raise error
 
     monkeypatch.setattr("warpgs.pipeline.run.export.export", full)
     line = failure(capsys, 4, "export", "run", "--to", "x.ply")
-    if error in NO_MEMORY:
-        assert "out of memory (" in line and "End other programs" in line and "total capacity" not in line
-        assert "--" not in line, "export has no flags of a fit"
-    else:
-        assert {LIBRARY: "a library cannot be loaded", THREADS: "too many threads"}[error] in line
-        assert "ulimit" in line and str(error) in line
+    assert "out of memory (" in line and "End other programs" in line and "total capacity" not in line and "ulimit" in line
 
 
 @pytest.mark.parametrize("program", [["-m", "warpgs"], ["-c", "import sys; from warpgs.app.cli import main; sys.exit(main())"]])

@@ -20,12 +20,11 @@ from warpgs.errors import WarpgsError
 from warpgs.export.ply import start_of
 from warpgs.export.sog import SOG
 from warpgs.export.spz import SPZ
-from warpgs.files import read_file
+from warpgs.files import input_digest, read_file
 from warpgs.io import folder as folders, image_files, images
 from warpgs.io.folder import READERS
 from warpgs.io.load import load_scene
 from warpgs.io.maps import read_numbers
-from warpgs.pipeline.farm.job import file_digest
 from warpgs.pipeline.metrics import lpips
 from warpgs.plugins import Registry
 from warpgs.poses.find import find_poses, source_digest
@@ -47,7 +46,7 @@ MORE = {
     **{f"a{suffix}": lambda p: find_poses(p, p.parent / "out") for suffix in image_files.VIDEO_SUFFIXES},
     **{f"mask{suffix}": folders.SceneFolder(Path(), images.ReadOptions(allow_outside=True)).mask for suffix in images.SUFFIXES},
     "b.ply": warpgs.read_ply, "c.ply": start_of, "b.spz": lambda p: SPZ().is_antialiased(p),
-    "b.sog": lambda p: SOG().is_antialiased(p), "artefact": file_digest, "render.png": lambda p: read_file(p, p.parent),
+    "b.sog": lambda p: SOG().is_antialiased(p), "artefact": input_digest, "render.png": lambda p: read_file(p, p.parent),
     "metrics.jsonl": read_events, "a.npy": read_numbers, "model.py": package,
     "plugin.py": lambda p: Registry("reader", object, None).load(f"{p}:Class"),
     "fcn.safetensors": lambda p: export._fcn_resnet18(export.ExportRequest("fcn-resnet18", str(p))),

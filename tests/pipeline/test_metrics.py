@@ -567,18 +567,12 @@ def test_bad_weights_are_named(weights, tmp_path, monkeypatch):
 
 
 @ALEX
-def test_the_command_and_files_that_cannot_be_mapped(files, tmp_path, capsys, monkeypatch):
+def test_the_command_and_what_it_says_of_files(files, tmp_path, capsys):
     net, _, _, backbone, heads = files
     out = tmp_path / "made.safetensors"
     assert main(["convert-lpips", "--backbone", str(backbone), "--heads", str(heads), "--out", str(out)]) == 0
     assert net in capsys.readouterr().out and out.is_file()
     assert main(["convert-lpips", "--backbone", str(backbone), "--heads", str(heads), "--out", str(out)]) == 2
     assert "exists" in capsys.readouterr().err
-    from safetensors.torch import load_file
-
-    notes = convert_lpips(files[3], files[4], tmp_path / "mapped")
+    notes = convert_lpips(files[3], files[4], tmp_path / "again")
     assert len(notes) == 3 and "not torchvision's published file" in notes[1] and "neither v0.0 nor v0.1" in notes[2]
-    monkeypatch.setattr("warpgs.files.DESCRIPTORS", tmp_path / "none")
-    convert_lpips(files[3], files[4], tmp_path / "read")
-    mapped, read = (load_file(tmp_path / name) for name in ("mapped", "read"))
-    assert mapped.keys() == read.keys() and all(torch.equal(t, read[n]) for n, t in mapped.items())

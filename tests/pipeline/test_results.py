@@ -371,14 +371,14 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
 @pytest.mark.usefixtures("tiny")
 @pytest.mark.parametrize("cause", ["folder", "disk"])
 def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
-    """A file stands where their folder should be, or the disk is full: said once, and the fit takes all its steps."""
+    """A file stands where their folder should be, or the disk is full: said of each, and the fit takes all its steps."""
     if cause == "disk":
         monkeypatch.setattr(results, "write_bytes", full)
     else:
         (tmp_path / "sampling").write_text("in the way")
     fit = fitted(CONFIG, CONFIG.steps, tmp_path)
-    assert fit.strategy.on_event is None and len(fit.messages) == 1
-    assert "images of sampling events are missing from the report" in fit.messages[0]
+    assert fit.strategy.on_event is None and len(fit.messages) == 2
+    assert "an image of sampling events is missing from the report" in fit.messages[0]
     assert ("no space left" if cause == "disk" else "cannot be created") in fit.messages[0]
 
 

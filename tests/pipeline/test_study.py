@@ -414,7 +414,7 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
     lines = out.splitlines()
     heads = "[1/2] still, a, seed 0", "[2/2] still, b, seed 0"
     first, second = (next(i for i, line in enumerate(lines) if line.startswith(head)) for head in heads)
-    assert sum("2 steps" in line for line in lines[first:second]) == 1 and lines[second - 1].startswith("  PSNR ")
+    assert sum("2 of 2 steps" in line for line in lines[first:second]) == 1 and lines[second - 1].startswith("  PSNR ")
     assert "next:" not in out and "one seed" in out and "table.tex" in out and "1 seed:" in out
     assert main(["compare", scene.path, "--out", str(tmp_path / "y"), "--presets", "a,zzz"]) == 2
     assert "preset 'zzz'" in capsys.readouterr().err
@@ -495,7 +495,7 @@ def test_interval_equals_scipys_paired_t(n, confidence):
     ours = base + 0.1 + 0.1 * rng.standard_normal(n)
     expected = stats.ttest_rel(ours, base).confidence_interval(confidence)
     d = paired_difference(list(ours), list(base), confidence)
-    assert (d.mean, d.sd, d.count) == pytest.approx((np.mean(ours - base), np.std(ours - base, ddof=1), n))
+    assert (d.mean, d.sd, len(d.values)) == pytest.approx((np.mean(ours - base), np.std(ours - base, ddof=1), n))
     assert (d.low, d.high) == pytest.approx((expected.low, expected.high), rel=1e-9)
     assert d.excludes_zero == (stats.ttest_rel(ours, base).pvalue < 1 - confidence)
 
@@ -522,7 +522,7 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert all(0 < float(c.get("cx")) < width and 0 < float(c.get("cy")) < height for c in circles)
     words = [t.text for t in root.findall(f"{SVG}text")]
     d = paired_difference([0.9, 1.0, 1.1], [0, 0, 0])
-    assert f"+1.00  [{d.low:+.2f}, {d.high:+.2f}]" in words and {"a", "b", "c", "d", "the base", "t <&>"} <= set(words)
+    assert f"+1.00 [{d.low:+.2f}, {d.high:+.2f}]" in words and {"a", "b", "c", "d", "the base", "t <&>"} <= set(words)
     xs = [float(c.get("cx")) for c in large]
     assert xs[1] < xs[2] < xs[0] and xs[0] - xs[2] == pytest.approx(xs[2] - xs[1], abs=0.2)
     # more PSNR is better, more LPIPS is worse, and what the interval does not decide is neither

@@ -440,7 +440,7 @@ def test_a_fit_and_what_follows(scene, tmp_path, capsys):
     assert record["scene"]["path"] == str(scene) and f"{BYTES}.png" in record["cameras"]
     page = (run / "report.html").read_text("utf-8")
     assert "b\\xe4ü" in page and not any("\ud800" <= c <= "\udfff" for c in page)
-    assert all(process.is_utf8(p.name) for p in (run / "renders").iterdir())
+    assert all(process.readable(p.name) == p.name for p in (run / "renders").iterdir())
     assert main(["fit", "--out", str(run), "--resume"]) == 0
     assert main(["eval", str(run), *CPU]) == 0
     assert main(["render", str(run), "--frames", "2", "--path", "turntable", *CPU]) == 0

@@ -7,16 +7,13 @@ from collections.abc import Sequence
 
 import warpgs.clock  # noqa: F401, imported first: its time stands for the start of the process
 from warpgs import process
-from warpgs.device import exhausted_limit, is_out_of_memory, keep_all_freed_memory, no_memory_message, wake_gpu
+from warpgs.device import is_out_of_memory, keep_all_freed_memory, no_memory_message, wake_gpu
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 from warpgs.plugins import own_frame
 from warpgs.ranks import last_words
 from warpgs.report.progress import waiting
 from warpgs.version import __version__
-
-FITTING = ("fit", "farm", "compare", "ablate")
-"""Commands that fit, and take the flags of a fit."""
 
 
 def report_defect(error: Exception, arguments: list[str]) -> int:
@@ -211,9 +208,7 @@ def _run(arguments: list[str]) -> int:
             return last_words("; ".join(["warpgs: interrupted", *map(str, e.args)]), 130)
     except Exception as e:
         if is_out_of_memory(e):
-            return last_words(f"warpgs: {no_memory_message(e, fitting=name in FITTING)}", ResourceError.exit_code)
-        if limit := exhausted_limit(e):
-            return last_words(f"warpgs: {limit}", ResourceError.exit_code)
+            return last_words(f"warpgs: {no_memory_message(e)}", ResourceError.exit_code)
         return report_defect(e, arguments)
 
 

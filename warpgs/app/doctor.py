@@ -1,7 +1,6 @@
 """`warpgs doctor`: checks of this machine, each by itself."""
 
 import importlib
-import importlib.metadata
 import importlib.util
 import os
 import platform
@@ -91,10 +90,7 @@ def _package(distribution: str, name: str, required: bool, use: str) -> Finding:
             remedy = f"pip install --force-reinstall {distribution}, or install the system library that the message names"
         without = "a fit needs it" if required else "a fit runs without it"
         return Finding(distribution, MISSING if required else NOTE, f"{_reason(e)} ({use}; {without})", remedy, required)
-    try:
-        detail = importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:  # built from source, or another build of the same module
-        detail = str(getattr(module, "__version__", "of unknown version"))
+    detail = str(getattr(module, "__version__", "of unknown version"))
     if name == "onnxruntime":
         names = [n.removesuffix("ExecutionProvider") for n in module.get_available_providers()]
         detail += f", providers: {', '.join(names)}"

@@ -502,8 +502,6 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
     if (kind := next((k for k in known if k.fits(path)), None)) is not None:
         return kind
     name = Path(path).name.lower()
-    if name.endswith(".htm"):
-        raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")
     if (Path(path) / "meta.json").is_file():
         raise UsageError(f"{path}: is the folder of a SOG model; give {Path(path) / 'meta.json'}")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""

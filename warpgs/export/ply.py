@@ -381,7 +381,7 @@ def _plain(path: Path, file: BinaryIO, notes: list[str]) -> base.Arrays:
 
     k, names = rest // 3, dtype.names or ()
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1 + k, 3)}
-    arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
+    arrays: dict[str, np.ndarray] = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
     if all(dtype[name].itemsize == 8 for name in _POSITION):  # maybe map coordinates
         arrays["means"] = np.empty((n, 3))
     for part in base.parts(n):

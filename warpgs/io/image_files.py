@@ -11,7 +11,6 @@ import contextlib
 import io
 import itertools
 import math
-import os
 import re
 import shlex
 import struct
@@ -97,12 +96,8 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None 
             return read_start(path, start)
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
     except OSError as e:
-        if os.path.exists(path):  # False for broken and circular links
-            what = f"the image cannot be read ({unread_reason(e)}); fix its permissions or copy it again"
-        else:
-            what = "is a broken link" if path.is_symlink() else "the image file is missing"
-            what += "; restore it, or remove its camera from the scene"
-        raise DataError(f"{path}: {what}") from e
+        fix = "restore it, or remove its camera from the scene"
+        raise DataError(f"{path}: the image cannot be read ({unread_reason(e)}); {fix}") from e
 
 
 # Size and damage. Functions take the bytes of a file, and raise a ValueError with the reason as part of a sentence.
@@ -157,15 +152,20 @@ def header_size(name: str, data: bytes) -> tuple[int, int]:
         return image.size
 
 
-def _png_size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px] of a PNG, whose chunks must lie in the file: OpenCV takes the memory that each announces."""
-    expect(len(data) >= 33 and data[12:16] == b"IHDR", "it has no header")
-    at, kind = len(PNG_START), b""
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield kind and bytes of each chunk of a PNG up to its end; they must lie in the file."""
+    view, at, kind = memoryview(data), len(PNG_START), b""
     while kind != b"IEND" and at < len(data):
         length, kind = struct.unpack_from(">I4s", data, at) if at + 8 <= len(data) else (len(data), b"")
         expect(at + 12 + length <= len(data), "it ends within a chunk")
-        expect(kind != b"IHDR" or at == len(PNG_START), "it has two headers")  # the second may announce another size
+        yield kind, view[at : at + 12 + length]
         at += 12 + length
+
+
+def _png_size(data: bytes) -> tuple[int, int]:
+    """Return width and height [px] of a PNG, whose chunks must lie in the file: OpenCV takes the memory that each announces."""
+    expect(len(data) >= 33 and data[12:16] == b"IHDR", "it has no header")
+    expect(sum(kind == b"IHDR" for kind, _ in png_chunks(data)) == 1, "it has two headers")  # of maybe different sizes
     return struct.unpack_from(">II", data, 16)
 
 

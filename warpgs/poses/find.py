@@ -203,18 +203,12 @@ def needs_poses(path: Path) -> bool:
 
 def source_digest(source: Path, allow_outside: bool = False) -> str:
     """Return the SHA-256 over the names and contents of a source's photographs, or of a video."""
-
-    def digest(path: Path) -> str:
-        try:
-            return files.input_digest(path)
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({files.unread_reason(e)}); fix its permissions or copy it again") from e
-
     if photos.is_video(source):
-        return digest(source)
+        return files.input_digest(source)
     root, total = photos.image_root(source), hashlib.sha256()
     for path in photos.photographs_inside(source, allow_outside):
-        total.update(path.relative_to(root).as_posix().encode("utf-8", "surrogateescape") + b"\0" + bytes.fromhex(digest(path)))
+        name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")
+        total.update(name + b"\0" + bytes.fromhex(files.input_digest(path)))
     return total.hexdigest()
 
 

@@ -36,15 +36,8 @@ def without_jpeg_metadata(data: bytes) -> bytes:
 
 def without_png_metadata(data: bytes) -> bytes:
     """Return a decodable PNG file with only those chunks that hold pixels."""
-    parts, at = [image_files.PNG_START], len(image_files.PNG_START)
-    while at + 12 <= len(data):
-        kind, begin = data[at + 4 : at + 8], at
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-        if kind in KEPT_CHUNKS:
-            parts.append(data[begin:at])
-        if kind == b"IEND":
-            break
-    return b"".join(parts)
+    chunks = (chunk for kind, chunk in image_files.png_chunks(data) if kind in KEPT_CHUNKS)
+    return b"".join([image_files.PNG_START, *chunks])
 
 
 SHARPNESS_SIDE = 640

@@ -105,8 +105,7 @@ def frame_sheet(frames: list[np.ndarray], columns: int = 3, gap: int = 4) -> np.
     """Return frames [H, W, 3] of one size in rows of ``columns``, with ``gap`` white pixels between them."""
     frames = frames + [np.ones_like(frames[0])] * (-len(frames) % columns)
     rows = [side_by_side(frames[i : i + columns], gap) for i in range(0, len(frames), columns)]
-    bar = np.ones((gap, rows[0].shape[1], 3), np.float32)
-    return np.concatenate([part for row in rows for part in (row, bar)][:-1])
+    return side_by_side([row.swapaxes(0, 1) for row in rows], gap).swapaxes(0, 1)
 
 
 def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:

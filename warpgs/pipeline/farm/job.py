@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol, get_type_hints
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.files import input_digest, read_file, unread_reason, write_json
+from warpgs.errors import DataError, UsageError
+from warpgs.files import input_digest, read_file, write_json
 from warpgs.io.folder import READERS, all_readers
 from warpgs.pipeline.run.folder import CONFIG
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
@@ -251,14 +251,6 @@ def read_job_record(folder: Path) -> JobRecord | None:
         return None
 
 
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits."""
-    try:
-        return input_digest(path, path.parent)
-    except OSError as e:
-        raise ResourceError(f"{path}: cannot be read ({unread_reason(e)}); check the disk, and fit the scene again") from e
-
-
 def source_stamp(scene: Path) -> str:
     """Return the SHA-256 of the names, sizes and times of a scene's files; empty if they cannot be listed or are too many."""
     paths = [scene] if scene.is_file() else []
@@ -278,8 +270,8 @@ def source_stamp(scene: Path) -> str:
 def is_whole(folder: Path, record: JobRecord) -> bool:
     """Return whether the files of a finished run match the checksums of its record."""
     try:
-        return set(record.files) == set(CHECKED) and all(file_digest(folder / n) == d for n, d in record.files.items())
-    except ResourceError:
+        return set(record.files) == set(CHECKED) and all(input_digest(folder / n, folder) == d for n, d in record.files.items())
+    except DataError:
         return False
 
 

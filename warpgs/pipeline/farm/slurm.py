@@ -29,7 +29,6 @@ MISSED = 3
 """A job is taken as ended if this many calls of squeue in a row do not list it: a network file system may show the job's answer
 late."""
 NAME = "warpgs"
-STATES = ("done", "failed", "held")
 SUFFIXES = (".json", ".answer", ".log")
 """Suffixes of the files of a job in the private folder: its description, its answer, its output."""
 SECONDS_TO_SAVE = 120
@@ -106,12 +105,9 @@ class SlurmEngine:
         events: list[Event] = []
         for name, (slurm_id, base) in self._running.items():
             if f"{base.name}.answer" in there:
-                if (state := base.with_suffix(".answer").read_text("utf-8")) in STATES:
-                    for suffix in SUFFIXES:
-                        base.with_suffix(suffix).unlink(missing_ok=True)
-                    events.append((name, state, ""))
-                else:
-                    events.append((name, "crashed", f"Slurm's job {slurm_id} ended with an unknown answer"))
+                events.append((name, base.with_suffix(".answer").read_text("utf-8"), ""))
+                for suffix in SUFFIXES:
+                    base.with_suffix(suffix).unlink(missing_ok=True)
             elif self._missed[name] >= MISSED:
                 log = base.with_suffix(".log")  # missing if the job never began
                 reason = _last_line(log.read_text("utf-8", "replace") if log.is_file() else "") or "no output"

@@ -15,6 +15,7 @@ import numpy as np
 from warpgs import files, schema
 from warpgs.device import is_out_of_memory, no_memory_message
 from warpgs.errors import DataError, FolderHeldError, UsageError, WarpgsError
+from warpgs.files import input_digest
 from warpgs.io.image_files import decode
 from warpgs.io.load import Split
 from warpgs.kernels.launch import set_threads
@@ -164,7 +165,7 @@ def fit_job(job: jobs.FarmJob, on_step: Callable[[StepReport], object] | None = 
         record = replace(
             record, psnr=metrics["test"].get("psnr"), ssim=metrics["test"].get("ssim"), steps=metrics["steps"],
             gaussians=metrics.get("gaussians", 0), ply_bytes=(out / jobs.PLY).stat().st_size,
-            files={n: jobs.file_digest(out / n) for n in jobs.CHECKED},
+            files={n: input_digest(out / n, out) for n in jobs.CHECKED},
         )  # fmt: skip
     jobs.write_record(job.folder, record)
     gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory is not freed

@@ -2,7 +2,6 @@
 
 import collections
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,13 +19,12 @@ from warpgs.pipeline.films import paths
 from warpgs.pipeline.metrics.coverage import classes_of, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.metrics.scores import Renders
 from warpgs.pipeline.model.table import FittedModel
-from warpgs.process import Say, say, silent
+from warpgs.process import Say, counted, say, silent
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.report.film import SUFFIXES, write_film
 from warpgs.report.images import coverage_image, frame_sheet, png, straight_alpha
 from warpgs.report.page import image_names
-from warpgs.report.progress import duration
 from warpgs.scene import Camera, Gaussians, View
 
 EMPTY = 0.1
@@ -333,15 +331,9 @@ def render_film(
         write_bytes(file, png(image if alpha is None else straight_alpha(image, alpha, model.background)))
 
     def images() -> Iterator[np.ndarray]:
-        frames, began = _frames(model, [c for _, c in plan.cameras], settings, coverage), 0.0
-        tell(f"rendering {count} frames")
+        frames = _frames(model, [c for _, c in plan.cameras], settings, coverage)
         with background() as start:
-            for i in range(count):
-                if i == 1:  # the first frame also waits for kernels and memory
-                    began = time.perf_counter()
-                elif i:
-                    left = (time.perf_counter() - began) / (i - 1) * (count - i)
-                    tell(f"rendering: {i} of {count} frames, {duration(left)} left")
+            for i in counted(range(count), tell, "rendering", "frames"):
                 image, alpha, outside, covered = next(frames)
                 faults.append(fault_of(image, alpha, plan.coverage, outside))
                 if files:

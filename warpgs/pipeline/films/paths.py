@@ -418,8 +418,6 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
     try:
         values = schema.parse(read_input(path, MAX_BYTES))
         KEYFRAMES(values, "keyframes")
-    except FileNotFoundError as e:
-        raise DataError(f"{path}: no such file; give a .json file of keyframes, as the viewer saves it") from e
     except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: no keyframes ({unread_reason(e)}); list objects of c2w (4 x 4), fov_y [rad], seconds") from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:

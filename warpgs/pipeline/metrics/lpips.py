@@ -13,7 +13,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from warpgs import files
 from warpgs.errors import DataError, UsageError
 from warpgs.files import open_input, read_tensors, remove_leftovers, tensor_pieces, unread_reason, write_bytes
 
@@ -104,7 +103,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
         try:
             _check_unpacked(file)
             # weights_only: tensors and plain containers, nothing that could run
-            state = torch.load(_mapped(file), map_location="cpu", weights_only=True, mmap=_mapped(file) is not file)
+            state = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as e:  # torch, pickle and zipfile raise a dozen types on malformed files
             reason = f"{type(e).__name__}: {str(e).partition(os.linesep)[0][:120]}"
             raise DataError(f"{path}: cannot be read as a torch state dict ({reason}); download it again") from e
@@ -113,15 +112,6 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     if not isinstance(state, dict):
         raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; save only the weights")
     return state, digest
-
-
-def _mapped(file: BinaryIO) -> str | BinaryIO:
-    """Return a path that lets torch map an open archive: then tensors use no memory before they are read."""
-    # Return the file itself if the system has no such paths, or if torch would have to unpickle the tensors.
-    name = files.DESCRIPTORS / str(file.fileno())
-    named = name.exists() and zipfile.is_zipfile(file)
-    file.seek(0)
-    return str(name) if named else file
 
 
 def _check_unpacked(file: BinaryIO) -> None:

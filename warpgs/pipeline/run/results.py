@@ -237,7 +237,6 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
     # cannot be written, the fit continues, with one message in ``fit.messages``.
     steps, strategy = shown_steps(fit.phases), fit.strategy
     disparities = fit.disparities or [None] * len(names)
-    lost: list[int] = []
     writing: list[Future[None]] = []
 
     def written() -> None:
@@ -254,9 +253,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
             make_folder(out / FOLDER)
             write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
         except ResourceError as e:
-            if not lost:
-                fit.messages.append(f"images of sampling events are missing from the report: {e}")
-            lost.append(step)
+            fit.messages.append(f"an image of sampling events is missing from the report: {e}")
 
     def on_event(step: int, sampled: Sequence[SampledView]) -> None:
         if step in steps:

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 
 from warpgs.errors import DataError, UsageError, WarpgsError
-from warpgs.files import write_bytes, write_csv, write_json, write_text
+from warpgs.files import input_digest, write_bytes, write_csv, write_json, write_text
 from warpgs.io.load import Split, held_out_split, split_views
 from warpgs.locks import hold_folder
 from warpgs.pipeline.farm.farm import make_engine, run_and_show
-from warpgs.pipeline.farm.job import PLY, FarmJob, file_digest
+from warpgs.pipeline.farm.job import PLY, FarmJob
 from warpgs.pipeline.farm.work import Outcome, ensure_run
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import over_white, render_view
@@ -160,7 +160,7 @@ def _same_files(request: StudyRequest, runs: Runs, scenes: list[str], variant: s
     """Return whether every run of a variant gave the same PLY as the base with the same scene and seed."""
     pairs = [(p, s) for p, v, s in runs if v == base and p in scenes and runs[p, v, s][1] and runs[p, variant, s][1]]
     files = [[run_folder(request, p, v, s) / PLY for v in (variant, base)] for p, s in pairs]
-    return bool(files) and all(file_digest(a) == file_digest(b) for a, b in files)
+    return bool(files) and all(input_digest(a) == input_digest(b) for a, b in files)
 
 
 def _table(request: StudyRequest, runs: Runs, scenes: list[str], caption: str) -> Table:
@@ -205,10 +205,8 @@ def _notes(request: StudyRequest, runs: Runs) -> list[str]:
         lost = [f"{p} seed {s}" for (p, name, s), (_, metrics, _) in runs.items() if name == v and metrics is None]
         if lost:
             notes.append(f"{v}: no result for {', '.join(lost)}; its means and paired differences exclude these seeds")
-    if request.seeds < 2:
-        notes.append("one seed gives no deviations and no intervals; run more seeds before you claim a difference")
-    elif request.seeds < 3:
-        notes.append("two seeds give wide, uncertain intervals; run at least three before you claim a difference")
+    if request.seeds < 3:
+        notes.append("one seed gives no intervals, two give uncertain ones; run at least three before you claim a difference")
     last = _metrics(runs)[-1]
     lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o[1])
     if last == "lpips":

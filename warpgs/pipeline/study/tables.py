@@ -30,11 +30,6 @@ class Sample:
     """Ends of an interval for the true mean."""
 
     @property
-    def count(self) -> int:
-        """Number of measurements."""
-        return len(self.values)
-
-    @property
     def excludes_zero(self) -> bool:
         """True if the interval does not contain 0; never with fewer than two measurements."""
         return self.low > 0 or self.high < 0
@@ -164,12 +159,12 @@ def markdown(table: Table) -> str:
     for name, own in table.samples.items():
         count = f"{own[GAUSSIANS].mean:,.0f}" if GAUSSIANS in own else NONE
         checks = ("✓" if m else "✗" for m in table.marks.get(name, ()))
-        seeds = str(max((s.count for s in own.values()), default=0))
+        seeds = str(max((len(s.values) for s in own.values()), default=0))
         body.append([name, *checks, *(table.cell(name, m, "**{}**") for m in table.metrics), *(count for _ in counts), seeds])
     lines, rows = [f"{SCORES}, the best mean in bold:", "", *_grid(head, body, 1 + len(marks)), ""], []
     for name, gaps in table.differences.items():
         sure = {m for m, d in (gaps or {}).items() if d.excludes_zero}
-        pairs = NONE if gaps is None else str(max(d.count for d in gaps.values()))
+        pairs = NONE if gaps is None else str(max(len(d.values) for d in gaps.values()))
         rows.append([name, *(table.gap(name, m) + " \\*" * (m in sure) for m in table.metrics), pairs])
     intervals = INTERVALS[len(rows) > 1]
     lines += [f"Difference to {table.base}, paired by seed, with {intervals}; \\* marks an interval without 0:", ""]
@@ -183,9 +178,9 @@ def csv_rows(table: Table) -> Iterator[list[str | int]]:
     for name, own in table.samples.items():
         for m in table.metrics:
             s, d = own.get(m, Sample(())), (table.differences.get(name) or {}).get(m)
-            gaps = [math.nan] * 3 if d is None else [d.mean, d.low, d.high]
+            gaps, pairs = ([math.nan] * 3, "") if d is None else ([d.mean, d.low, d.high], len(d.values))
             mean, sd, *gaps = (repr(v) if math.isfinite(v) else "" for v in (s.mean, s.sd, *gaps))
-            yield [name, *map(int, table.marks.get(name, ())), m, mean, sd, s.count, *gaps, "" if d is None else d.count]
+            yield [name, *map(int, table.marks.get(name, ())), m, mean, sd, len(s.values), *gaps, pairs]
 
 
 _LATEX = str.maketrans(
@@ -252,13 +247,11 @@ def _line(table: Table, name: str, metric: str, y: float, x0: float, px: Callabl
         return [_text(right, y + 7, words, 11, color=SOFT)]
     color = (BETTER if (d.mean > 0) == upwards else WORSE) if d.excludes_zero else UNDECIDED
     parts = [_dot(px(v), y + 10, 2.8, color, ' fill-opacity="0.45"') for v in d.values]
-    words = f"{d.mean:+.{digits}f}"
     if math.isfinite(d.low):
         bar = f"M{px(d.low):.1f} {y - 6:.1f}v12m0 -6H{px(d.high):.1f}m0 -6v12"
         parts.append(f'<path d="{bar}" fill="none" stroke="{color}" stroke-width="2"/>')
-        words += f"  [{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
     parts.append(_dot(px(d.mean), y, 5.5, color, ' stroke="#ffffff" stroke-width="1.5"'))
-    return [*parts, _text(right, y + 7, words, 11, color=color, weight=600 if d.excludes_zero else 400)]
+    return [*parts, _text(right, y + 7, interval(d, digits), 11, color=color, weight=600 if d.excludes_zero else 400)]
 
 
 def forest(table: Table) -> str:
@@ -266,7 +259,7 @@ def forest(table: Table) -> str:
     base = table.base
     gaps = [own for own in table.differences.values() if own is not None]
     measured = {m: [own[m] for own in gaps if m in own] for m in table.metrics}
-    panels = {m: differences for m, differences in measured.items() if any(d.count for d in differences)}
+    panels = {m: differences for m, differences in measured.items() if any(d.values for d in differences)}
     names = list(table.samples) if panels else []
     left = MARGIN + max([90.0, *(LETTER * len(n) + 18 for n in names)])
     step = PANEL + VALUES + GAP
