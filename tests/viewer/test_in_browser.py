@@ -428,6 +428,10 @@ def test_the_viewer_has_the_limits_of_the_page(folder, browser):
         browser.wait(f"{tilt}?.z === 0")
         browser.value("void __viserMutable.cameraControl.rotate(1, 0, false)")
         assert browser.value(TURNED) - first == pytest.approx(arc[1] + 0.95 * margin + 1, abs=0.002)
+        window.step_into(content.model.train[-1], None)  # within the captured arc, perhaps not within the supported one
+        assert window._limits is window._widest
+        window.move(window.first, None)
+        assert window._limits is window._narrow is not window._widest
         assert trouble(browser) == []
     finally:
         window.close()
