@@ -118,7 +118,7 @@ def similar_folder(path: Path) -> str:
 def install_extras(*names: str) -> str:
     """Return the words on how to install extras by name; warpgs is on no package index."""
     extras = f"[{','.join(names)}]"
-    return f"`pip install '.{extras}'` in your copy of the repository; of a wheel, append {extras} to its path"
+    return f"`pip install '.{extras}'` in your copy of the repository, or add {extras} to the path of the wheel"
 
 
 Kind = TypeVar("Kind", bound=type)

@@ -37,7 +37,7 @@ def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
     (found,) = doctor._extras()
     assert found.status == NOTE and "view; not installed: poses (photographs without cameras), formats" in found.detail
     extras = "[poses,formats]"
-    assert found.remedy == f"`pip install '.{extras}'` in your copy of the repository; of a wheel, append {extras} to its path"
+    assert found.remedy == f"`pip install '.{extras}'` in your copy of the repository, or add {extras} to the path of the wheel"
 
 
 def test_this_machine_can_fit():

@@ -190,8 +190,8 @@ def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray
     heights = np.clip((ways * up).sum(1), -1, 1)
     flat = ways - heights[:, None] * up
     level = np.abs(heights) < max(0.95, abs(heights[0]) + 1e-9)  # straight down there is no azimuth
-    azimuths = np.arctan2((flat * np.cross(up, flat[0])).sum(1), (flat * flat[0]).sum(1))[level]
-    azimuths = np.sort(azimuths.round(9))  # -1e-17 for the first camera itself would be a whole turn
+    # rounded, since -1e-17 for the first camera itself would be a whole turn
+    azimuths = np.sort(np.arctan2((flat * np.cross(up, flat[0])).sum(1), (flat * flat[0]).sum(1))[level].round(9))
     gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
     widest = int(np.argmax(gaps))  # the arc is all but the widest gap, and has the first camera at 0
     if gaps[widest] > ALL_ROUND:
@@ -206,19 +206,16 @@ SIDE, TRIED, SUPPORT = 160, 8, 0.8
 surface that two photographs saw, as a fraction of this part at the first camera: below it, smears prevail."""
 
 
-def _small(camera: Camera) -> Camera:
-    factor = SIDE / max(camera.width, camera.height)
-    return framed(camera, (max(1, round(factor * camera.width)), max(1, round(factor * camera.height))))
-
-
 def supported(
     gaussians: Gaussians, cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray, arc: np.ndarray, margin: float
 ) -> tuple[np.ndarray, float]:
     """Return an arc and a margin that end, on each side, before views that show mostly what fewer than two cameras saw."""
     if len(cameras) < 2:
         return arc, margin
-    first, renders = _small(cameras[0]), Renders(gaussians, RasterizeOptions())
-    photographs = depth_views(renders, [_small(c) for c in cameras])
+    sizes = [-(-SIDE * np.array([c.width, c.height]) // max(c.width, c.height)) for c in cameras]
+    renders = Renders(gaussians, RasterizeOptions())
+    photographs = depth_views(renders, [framed(c, (int(w), int(h))) for c, (w, h) in zip(cameras, sizes)])
+    first = photographs[0][0]
 
     def share(axis: np.ndarray, angle: float) -> float:
         turn = rotation_matrices(np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)]))
@@ -238,8 +235,7 @@ def supported(
 
 def add_limits(server: viser.ViserServer, away: np.ndarray, arc: np.ndarray, margin: float, on: bool = True) -> None:
     """Give pages the limits about the first camera, ``away`` [u] from the target, as positions of nodes that draw nothing."""
-    positions = {"": away, "/sides": (*arc[:2], margin), "/tilt": (*arc[2:], on)}
-    for name, position in positions.items():
+    for name, position in {"": away, "/sides": (*arc[:2], margin), "/tilt": (*arc[2:], on)}.items():
         server.scene.add_frame(LIMITS + name, show_axes=False, position=np.minimum(position, 1e3).astype(float))
 
 

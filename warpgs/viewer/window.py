@@ -543,16 +543,11 @@ class Window:
             self._drawn.clear()
         self._wake.set()
 
-    def limit(self) -> None:
-        """Send the limits of turning to the browsers, as the panel switches them."""
-        html.add_limits(self.server, self.first.center - self._place[0], *self._limits, bool(self.panel.limits.value))
-
-    def _measure(self) -> None:
-        """Narrow the limits to views that the photographs support, once for each model."""
-        model, self._unmeasured = self._unmeasured, None
+    def limit(self, model: FittedModel | None = None) -> None:
+        """Send the limits of turning to the browsers, as the panel switches them; narrow them to what a model supports."""
         if model is not None:
             self._narrow = self._limits = html.supported(model.gaussians(), self._photographs, *self._place, *self._widest)
-            self.limit()
+        html.add_limits(self.server, self.first.center - self._place[0], *self._limits, bool(self.panel.limits.value))
 
     def _draw_cameras(self) -> None:
         """Draw the cameras with their photographs; a click steps into one."""
@@ -639,7 +634,9 @@ class Window:
             time.sleep(SETTLED)
             if self._wake.is_set() or not self._open:
                 continue  # still moving
-            guarded(self._measure)()
+            model, self._unmeasured = self._unmeasured, None
+            if model is not None:
+                guarded(self.limit)(model)
             for client in list(self.server.get_clients().values()):
                 try:
                     self._render_for(client)
