@@ -46,7 +46,7 @@ def test_lines_have_all_values_and_the_last_one_stays(capsys, clock, terminal):
             progress.update(step=step, loss=0.25, psnr=20.5, count=12345, seconds=2)
     lines = capsys.readouterr().out.splitlines()
     assert 15 <= len(lines) <= 22
-    assert lines[-1] == "fitting: 100 of 100 steps, left 0 s, PSNR 20.50 dB, loss 0.2500, 12,345 Gaussians, 2000 ms per step"
+    assert lines[-1] == "fitting: 100 of 100 steps, left 0 s, PSNR 20.50 dB, 12,345 Gaussians, loss 0.2500, 2000 ms per step"
     out = terminal()
     with Progress(10) as progress:
         for step in range(1, 11):

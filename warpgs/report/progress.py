@@ -84,16 +84,16 @@ class _StatusLine:
         """Return rich's display of one task, which draws itself eight times a second until it is stopped."""
         from rich.console import Console
         from rich.progress import BarColumn, Progress as Display, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.table import Column
 
         console, own = Console(file=careful(sys.stdout)), sys.stderr is not None and sys.stderr.isatty()
         columns = (
             SpinnerColumn("dots" if (console.encoding or "").startswith("utf") else "line"),
-            TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
-            TimeElapsedColumn(),
+            TextColumn("{task.description}", markup=False), BarColumn(24),
+            TextColumn("{task.fields[detail]}", markup=False, table_column=Column(ratio=1, no_wrap=True)), TimeElapsedColumn(),
         )  # fmt: skip
-        display = Display(
-            *columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own
-        )  # a redirected stderr disturbs no line
+        # a redirected stderr disturbs no line
+        display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own, expand=True)
         display.start()
         return display
 
@@ -190,7 +190,7 @@ class Progress:
         """Return the state of the fit as one line."""
         left = "-" if self.left is None else duration(self.left)
         each = "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"
-        values = f"PSNR {self.psnr:.2f} dB, loss {self.loss:.4f}, {self.count:,} Gaussians, {each} per step"
+        values = f"PSNR {self.psnr:.2f} dB, {self.count:,} Gaussians, loss {self.loss:.4f}, {each} per step"
         return f"fitting: {self.step:,} of {self.total:,} steps, left {left}, {values}"
 
 
