@@ -27,8 +27,9 @@ import torch
 from bench.lib import result_file
 from bench.lib.arguments import parse
 from warpgs.app.farm import jobs_of as farm_jobs
+from warpgs.files import input_digest
 from warpgs.pipeline.farm.farm import JobStatus, LocalEngine, Slot, make_engine, run_farm
-from warpgs.pipeline.farm.job import LOG, PLY, Engine, FarmJob, file_digest, list_jobs
+from warpgs.pipeline.farm.job import LOG, PLY, Engine, FarmJob, list_jobs
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.settings import FitConfig
@@ -63,7 +64,7 @@ def farm_command(scenes: Path, out: Path, steps: int, slots: int) -> list[str]:
 
 def digests(out: Path, names: list[str]) -> list[str]:
     """Return the SHA-256 of the PLY file of each job."""
-    return [file_digest(out / n / "run" / PLY) for n in names]
+    return [input_digest(out / n / "run" / PLY) for n in names]
 
 
 def one_by_one(scenes: dict[str, Path], out: Path, steps: int) -> float:

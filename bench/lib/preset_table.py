@@ -84,11 +84,11 @@ def rivals_table(rows: list[dict], base: str) -> str:
         if base not in scores or len(scores) < 2:
             continue
         d, names = rival(scores, base)
-        if not d.count:
+        if not d.values:
             lines.append([name, 0, "two seeds of each are needed", "", ""])
             continue
         worst = min(worst, (d.mean, name))
-        lines.append([name, d.count, ", ".join(names), f"{d.mean:+.2f}", f"[{d.low:+.2f}, {d.high:+.2f}]"])
+        lines.append([name, len(d.values), ", ".join(names), f"{d.mean:+.2f}", f"[{d.low:+.2f}, {d.high:+.2f}]"])
     if not lines:
         return ""
     text = markdown(["row", "seeds", "best of the others", f"{base} - best [dB]", "95 % interval"], lines)

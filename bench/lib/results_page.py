@@ -124,7 +124,7 @@ def scores() -> str:
         d = paired_difference([scored[k] for k in pairs], [uniform[k] for k in pairs], confidence)
         means = [mean_sd([values[k] for k in pairs]) for values in (uniform, scored)]
         mean = round(d.mean, 2) + 0.0  # not -0.00
-        body.append([words, d.count, *means, f"{mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"])
+        body.append([words, len(d.values), *means, f"{mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"])
     head = ["scene", "fits", "sampled uniformly", "sampled by all three scores", "difference"]
     files = ", ".join(f"`{file}.json`" for file in dict.fromkeys(file for file, _ in SCORED.values()))
     note = "held-out PSNR [dB]; objects: over white, and measured before `default` smoothed depth with 8 views"
