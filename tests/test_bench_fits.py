@@ -203,10 +203,10 @@ def test_rivals_and_tables_of_presets():
     scores = {"default": [20.0, 20.0, 20.0], "even": [20.1, 20.1, 20.1], "lucky": [19.0, 25.0, 19.0]}
     d, names = rival({k: dict(enumerate(v)) for k, v in scores.items()}, "default")
     assert sorted(names) == ["even", "lucky"]
-    assert d.mean == pytest.approx(((20 - 19) + (20 - 20.1) + (20 - 19)) / 3) and d.count == 3
+    assert d.mean == pytest.approx(((20 - 19) + (20 - 20.1) + (20 - 19)) / 3) and len(d.values) == 3
     weak = {"default": dict.fromkeys(range(3), 20.0), "weak": dict.fromkeys(range(3), 1.0), "best": {0: 21.0, 1: 21.0}}
     shorter, _ = rival(weak, "default")
-    assert shorter.count == 2 and shorter.mean == pytest.approx(-1), "seeds that the best lacks are not compared"
+    assert len(shorter.values) == 2 and shorter.mean == pytest.approx(-1), "seeds that the best lacks are not compared"
     rows = results("a", "default", [20.0, 20.2, 19.5], jobs=1) + results("a", "x", [20.1, 20.1, 20.1], jobs=6)
     rows += results("b", "x", [1.0], left_out="u") + results("b", "x", [3.0], left_out="v")
     rows += [{"row": "b", "preset": "default", "seed": 0, "error": "E: no"}]

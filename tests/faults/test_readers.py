@@ -106,7 +106,7 @@ REASONS = {
     "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST},
     "poses/photographs.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE,
-        "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN},
+        "main": PIPE, "match": OWN, "extract": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN},
     "priors/export.py": {"_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do",
         "package_files": "reads files whose SHA-256 must be known", "_backbone": "loads weights whose SHA-256 is known",
         "onnx_bytes": OWN},

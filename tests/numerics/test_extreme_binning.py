@@ -76,7 +76,7 @@ def test_counts_and_sizes_beyond_their_bits_are_refused(device):
         launch.launch(None, 2**31, [], device)
     launch._check_size(2**31 - 1)
     projected, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
-    with pytest.raises(ResourceError, match=r"2,147,483,648 tiles of 8 px.* fewer cameras"):
+    with pytest.raises(ResourceError, match=r"2,147,483,648 tiles.* fewer cameras"):
         bin_tiles(projected, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
 
 

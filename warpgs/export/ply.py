@@ -12,6 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from warpgs import geometry
 from warpgs.errors import DataError, expect, listed
 from warpgs.export import base
 from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, PlyElement, ply_header, replacing
@@ -340,6 +341,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         warpgs.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
     path, kind = Path(path), PLY()
+    normalization = geometry.checked_normalization(normalization, units, str(path))
     if is_compressed(start_of(path)):
         raise DataError(f"{path}: is a compressed PLY file, which read_ply does not read; use warpgs.export.read_gaussians")
     gaussians = kind.read(path, normalization, units)

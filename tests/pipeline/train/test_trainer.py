@@ -218,7 +218,7 @@ def test_interrupted_fit_saves_the_step_in_progress(tmp_path, heeding):
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     for line in process.stdout:
-        if line.startswith("step"):
+        if line.startswith("fitting"):
             break
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)

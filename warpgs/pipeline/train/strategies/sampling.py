@@ -167,8 +167,7 @@ def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeO
     total = torch.zeros(len(gaussians), device=gaussians.means.device, dtype=torch.float32)
     for _, same in itertools.groupby(cameras[:: -(-len(cameras) // MAX_WEIGHED)], lambda c: (c.width, c.height, c.model)):
         left = [*same]
-        size = max(len(gaussians), left[0].width * left[0].height)
-        at_once = 1 if options.max_instances else max(1, WEIGHED_SIZE // size)
+        at_once = 1 if options.max_instances else max(1, WEIGHED_SIZE // max(len(gaussians), left[0].width * left[0].height))
         while left:
             for weights in rasterize(gaussians, batch_of(left[:at_once]), weigh).weight_sums:
                 total += weights
