@@ -91,8 +91,8 @@ def hold_folder(folder: Path, *parts: str, name: str = LOCK) -> Iterator[list[st
 def hold_file(path: Path) -> contextlib.AbstractContextManager[list[str]]:
     """Lock a file that the block writes, in a folder that no process holds; see `hold_folder`."""
     # other processes may write other files of the folder; a lock of a killed process is swept as other leftovers are
-    if os.path.isdir(path):
-        raise UsageError(f"{path}: is a folder; give the name of the file to write, such as one in this folder")
+    if os.path.isdir(path) or len(os.fsencode(path.name)) > 255:  # before the work, not when the file is written
+        raise UsageError(f"{path}: is a folder, or the name is too long; give the name of the file to write")
     check_free(path.parent)
     return hold_folder(path.parent, name=f".warpgs-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}.tmp{LOCKED}")
 

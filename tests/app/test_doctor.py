@@ -155,6 +155,7 @@ def test_eighty_columns_keep_the_keys_whole():
     assert code == 4 and max(map(len, rows)) <= 80 and "\x1b" not in text
     for key in ("opencv-contrib", "onnxruntime", "scikit-image", "Kernel cache"):
         assert sum(row.strip().startswith(key) for row in rows) >= 1
+    assert "fix: update" in text and "python-headless" not in text
     assert "[bold]none[/bold]" in text  # what was found is shown as it is, never read as markup
     assert text.replace("\n", "").replace(" ", "").count("/a/very/long/path") == 9
     assert "\x1b[" in text_of(findings, terminal=True)[0]

@@ -112,6 +112,11 @@ def test_doubles_in_map_coordinates(tmp_path, text):
         np.testing.assert_allclose(back.means.numpy(), rows[:, :3], rtol=0, atol=1e-6)
         assert back.means.dtype == torch.float64 and scene.means.dtype == torch.float32
         np.testing.assert_allclose(scene.means.numpy(), 0.2 * (rows[:, :3] - normalization.offset), rtol=0, atol=1e-6)
+    rows[7, 0] = 1e300
+    (tmp_path / "a.ply").write_bytes(ply(header, rows.astype("<f8").tobytes()))
+    with pytest.warns(UserWarning) as warned:
+        assert len(read_ply(tmp_path / "a.ply")) == 49
+    assert ["1 of 50 Gaussians left out" in str(w.message) for w in warned] == [True]
 
 
 @pytest.mark.parametrize("words", ["1 2", "1 2 nan", "a b c", "1 2 3 4"])

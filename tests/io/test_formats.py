@@ -421,6 +421,7 @@ def test_points_of_a_ply_file_are_read(form, kind, tmp_path):
         (ply(CLOUD).replace(b"vertex 60", b"vertex -1"), "points cannot be understood"),
         (ply(CLOUD * np.nan), "60 of 60 points are not finite"),
         (ply(CLOUD).replace(b"element vertex", b"element other"), "first element is not vertex"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "first element is not vertex"),
         (ply(CLOUD).replace(b"format ascii", b"format other"), "points cannot be understood"),
         (ply(CLOUD).replace(b"double x", b"list uchar int x"), "points cannot be understood"),
         (ply(CLOUD).replace(b"quality", b"z"), "have one twice"),

@@ -51,8 +51,9 @@ def test_a_second_holder_is_told_whose_the_folder_is_and_impossible_paths_are_na
         assert refusal(tmp_path).startswith(f"{tmp_path}: another process is writing there")
     (tmp_path / "made.ply").mkdir()
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="is a folder; give"), hold_file(tmp_path / "made.ply"):
-        pytest.fail("held")
+    for name in ("made.ply", f"{'ü' * 126}.ply"):  # of 256 bytes
+        with pytest.raises(UsageError, match="is a folder, or the name is too long; give"), hold_file(tmp_path / name):
+            pytest.fail("held")
     for name in ("x" * 300, "file/below"):
         with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
             pytest.fail("held")

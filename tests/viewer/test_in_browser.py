@@ -128,6 +128,10 @@ def test_limits_end_where_fewer_than_two_photographs_saw_the_surface():
 
     few, many = ends(0, 10, 170), ends(*range(0, 180, 10))
     assert 10 < few[1] < 30 and few[0] == pytest.approx(15, abs=3) and 170 < many[1] < 185
+    # cameras without a centre have no such views, and the limits are those of the arc
+    parallel = [dataclasses.replace(looking(a), model="orthographic") for a in (0.0, 0.2, 2.0)]
+    limits = html.turning_limits(parallel, TARGET, UP)
+    assert html.supported(g, parallel, TARGET, UP, *limits) == limits
     # the first camera at an end of the arc, a rounding error beyond it, is no whole turn
     for i in range(8):
         up = np.array([0.1 * i, -1, 0.05]) / np.hypot(0.1 * i, np.hypot(1, 0.05))

@@ -257,8 +257,8 @@ def print_report(findings: list[Finding], console=None) -> int:
     table.add_column("Detail, and what to do", overflow="fold")
     for f in findings:
         style, detail = styles[f.status], escape(printable(f.detail))
-        fix = f"\n[{style}]{escape(printable(f.remedy))}[/]" if f.status != OK and f.remedy else ""
-        table.add_row(escape(f.topic), f"[{style}]{f.status}[/]", detail + fix)
+        fix = f"\n[{style}]fix: {escape(printable(f.remedy))}[/]" if f.status != OK and f.remedy else ""
+        table.add_row(escape(f.topic.removesuffix("-python-headless")), f"[{style}]{f.status}[/]", detail + fix)
     console.print(table)
     if stops := [f.topic for f in findings if f.status == MISSING and f.required]:
         console.print(f"[bold red]A fit cannot run yet[/]: {escape(', '.join(stops))}.")

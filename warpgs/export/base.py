@@ -405,7 +405,8 @@ class Format:
             stated = self.origin_in(path)
         self.origin = np.zeros(3) if stated is None else checked_origin(stated, str(path))
         if (means := arrays["means"]).dtype == np.float64 and (middle := origin_of(means[:ROWS])).any():
-            moved = np.subtract(means, middle, out=np.empty(means.shape, np.float32), casting="same_kind")
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved = np.subtract(means, middle, out=np.empty(means.shape, np.float32), casting="same_kind")
             arrays, self.origin = arrays | {"means": moved}, self.origin + middle
         return gaussians_of(path, arrays, lambda: self.strict or self.is_own(path), self.notes)
 

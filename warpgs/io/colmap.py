@@ -298,7 +298,8 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
     """
     data = read_file(path, fix="fix its permissions or copy it again")
     try:
-        ((name, count, properties), *_), start, text = ply_header(data[:MAX_HEADER_BYTES])
+        elements, start, text = ply_header(data[:MAX_HEADER_BYTES])
+        name, count, properties = elements[0] if elements else ("", 0, [])
         kinds, body = dict(properties), data[start:]
         expect(name == "vertex", "its first element is not vertex")
         plain = len(kinds) == len(properties) and PLY_LIST not in kinds.values()

@@ -18,7 +18,7 @@ from warpgs import geometry
 from warpgs.device import format_bytes
 from warpgs.errors import DataError
 from warpgs.files import write_text
-from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
+from warpgs.geometry import CENTRAL, convert_camera, convert_gaussians, look_at, matmul, pose_at, quaternions, rotation_matrices
 from warpgs.locks import hold_file
 from warpgs.pipeline.films.paths import fov_y, framed, rig_among, rig_of, upright
 from warpgs.pipeline.metrics.coverage import coverage_map, depth_views
@@ -210,7 +210,7 @@ def supported(
     gaussians: Gaussians, cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray, arc: np.ndarray, margin: float
 ) -> tuple[np.ndarray, float]:
     """Return an arc and a margin that end, on each side, before views that show mostly what fewer than two cameras saw."""
-    if len(cameras) < 2:
+    if len(cameras) < 2 or not all(c.model in CENTRAL for c in cameras):
         return arc, margin
     sizes = [-(-SIDE * np.array([c.width, c.height]) // max(c.width, c.height)) for c in cameras]
     renders = Renders(gaussians, RasterizeOptions())

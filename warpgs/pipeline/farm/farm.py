@@ -292,11 +292,11 @@ def row_values(row: JobRecord) -> tuple[str, ...]:
 
 
 def progress_line(statuses: list[JobStatus], slots: int, seconds: float) -> str:
-    """Return the numbers of jobs that ended and by state, the time that passed, and the time left."""
+    """Return the number of jobs that ended, the time left, the numbers by state, and the time that passed."""
     counts, left = Counter(s.state for s in statuses), seconds_left(statuses, slots)
     states = ", ".join(f"{counts[s]:,} {s}" for s in STATES if counts[s])
-    ending = f", left {duration(left)}" if left else ""
-    return f"farm: {counts['done'] + counts['failed']:,} of {len(statuses):,} jobs, {states}, after {duration(seconds)}{ending}"
+    ended = f"{counts['done'] + counts['failed']:,} of {len(statuses):,} jobs{f', left {duration(left)}' if left else ''}"
+    return f"farm: {ended}, {states}, after {duration(seconds)}"  # a narrow terminal cuts the end
 
 
 SHORT = 120

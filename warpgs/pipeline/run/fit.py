@@ -285,10 +285,8 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Say, ranks: in
             matcher=request.matcher, progress=progress,
         )  # fmt: skip
     lost = [f"{p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
-    return replace(request, path=str(scene), matcher=None), [
-        *record["notes"],
-        *([f"no pose: {listed(lost, 5)}"] if lost else []),
-    ]
+    notes = [*record["notes"], *([f"no pose: {listed(lost, 5)}"] if lost else [])]
+    return replace(request, path=str(scene), matcher=None), notes
 
 
 SHOWN_ADVICE = 3
