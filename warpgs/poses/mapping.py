@@ -216,15 +216,10 @@ def extract(pycolmap: Any, job: Json) -> None:
     mode, reader, names = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions(), job["names"]
     with pycolmap.Database.open(DATABASE) as database:
         order = numbers_of(database, job)
-
-        def progress() -> str:
-            return f"finding features: {sum(map(database.exists_keypoints, order))} of {len(names)} photographs"
-
         _watched(
             lambda: pycolmap.extract_features(DATABASE, IMAGES, names, mode, reader, options, pycolmap.Device.cpu),
-            progress,
-            job,
-        )
+            lambda: f"finding features: {sum(map(database.exists_keypoints, order))} of {len(names)} photographs", job,
+        )  # fmt: skip
 
 
 def _watched(call: Callable[[], object], progress: Callable[[], str], job: Json) -> None:
