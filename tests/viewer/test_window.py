@@ -19,13 +19,13 @@ from tests.viewer import wait_shown
 from warpgs.app.cli import main
 from warpgs.errors import DataError
 from warpgs.geometry import convert_gaussians
-from warpgs.pipeline.films.paths import fov_y
+from warpgs.pipeline.films.paths import fov_y, rig_among
 from warpgs.pipeline.model.edit import any_of
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.run import level
 from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.synthetic.demo import split_spec, write_demo
-from warpgs.viewer import watch, window as windows
+from warpgs.viewer import html, watch, window as windows
 from warpgs.viewer.html import middle_first, wxyz_of
 from warpgs.viewer.server import open_server, stop_server
 from warpgs.viewer.window import (
@@ -152,6 +152,25 @@ def test_layers_and_the_crop_box_choose_what_is_shown_and_saved(window, tmp_path
     shown = convert_gaussians(window.shown(), n, "scene", "file").means
     panel._crop.value = False
     assert torch.equal(warpgs.read_ply(tmp_path / "a.ply").means, shown)
+
+
+def test_a_page_of_photographs_on_their_side_turns_about_the_direction_that_they_have_in_common(folder, tmp_path, monkeypatch):
+    """One photograph is shown upright, and the others still lie: together they would have another direction."""
+    real, given = html.open_run, []
+    roll = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+    def lying(*words):
+        run = real(*words)
+        cameras = {n: dataclasses.replace(c, viewmat=roll @ c.viewmat) for n, c in run.scene_cameras.items()}
+        return dataclasses.replace(run, scene_cameras=cameras)
+
+    monkeypatch.setattr(html, "open_run", lying)
+    monkeypatch.setattr(html, "write_html", lambda path, *words: given.append(words) or (path.write_text("") or []))
+    html.export_html(folder / "run", tmp_path / "scene.html")
+    gaussians, *_, normalization = given[0]
+    run = lying(folder / "run", "cpu")
+    up = rig_among([run.scene_cameras[n] for n in run.train], gaussians.means.double().numpy()).up
+    np.testing.assert_allclose(normalization.up, up, atol=1e-6)
 
 
 def test_the_first_view_is_that_of_the_page_and_a_narrow_window_shows_the_whole_width(window):

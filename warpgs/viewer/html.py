@@ -318,6 +318,8 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
         found = replace(found, up=None if found.up is None else found.rotation @ rotation @ found.rotation.T @ found.up)
     gaussians = convert_gaussians(gaussians, found, "file", "scene")
     cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
+    if found.up is None:  # of the cameras as they are: the first one alone is made upright below
+        found = replace(found, up=rig_among(cameras, gaussians.means.double().numpy()).up)
     with hold_file(target) as held:
         title = target.stem.encode("utf-8", "replace").decode()  # ? for bytes that are not UTF-8
         notes = write_html(target, gaussians, middle_first(cameras, gaussians), run.background, title, found)
