@@ -317,7 +317,12 @@ def sweep_temporary_files() -> None:
 
 
 def system_folder() -> Path:
-    """Return the system's temporary folder: TMPDIR, TEMP or TMP, if one is set."""
+    """Return the first usable folder of TMPDIR, TEMP and TMP, else the system's temporary folder; set it in `tempfile`, too."""
+    if tempfile.tempdir is None and not WINDOWS:
+        # Python would write a file to try each of these, which a command that is killed then leaves behind
+        named = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
+        usable = (f for f in (*named, "/tmp") if f and os.path.isdir(f) and os.access(f, os.W_OK | os.X_OK))
+        tempfile.tempdir = next(map(os.path.abspath, usable), None)
     return Path(tempfile.gettempdir()).resolve()
 
 

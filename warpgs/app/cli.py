@@ -1,5 +1,6 @@
 """The command line: finds the command, runs it, and reports errors in one line with an exit code."""
 
+import contextlib
 import importlib
 import os
 import sys
@@ -9,6 +10,7 @@ import warpgs.clock  # noqa: F401, imported first: its time stands for the start
 from warpgs import process
 from warpgs.device import is_out_of_memory, keep_all_freed_memory, no_memory_message, wake_gpu
 from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
+from warpgs.folders import system_folder
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 from warpgs.plugins import own_frame
 from warpgs.ranks import last_words
@@ -26,12 +28,17 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
         line = f"warpgs: this command needs the Python package {gone}, which is missing; reinstall warpgs with pip"
         return last_words(line, UsageError.exit_code)
     details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
-    with tempfile.NamedTemporaryFile(prefix="warpgs-error-", suffix=".txt", delete=False) as f:
-        f.write(details.encode("utf-8", "backslashreplace"))
+    try:
+        with tempfile.NamedTemporaryFile(prefix="warpgs-error-", suffix=".txt", delete=False) as f:
+            f.write(details.encode("utf-8", "backslashreplace"))
+        where = f"in {f.name}"
+    except OSError:  # no folder can be written
+        process.say_lines(details.splitlines(), error=True)
+        where = "above"
     said = f"{type(error).__name__}: {error}"
     if own := own_frame(error):
-        return last_words(f"warpgs: {said} (in your own code, {own}; the details are in {f.name})", UsageError.exit_code)
-    more = f"This is a bug in warpgs; please report it with the details in {f.name}"
+        return last_words(f"warpgs: {said} (in your own code, {own}; the details are {where})", UsageError.exit_code)
+    more = f"This is a bug in warpgs; please report it with the details {where}"
     return last_words(f"warpgs: internal error, {said}. {more}", WarpgsError.exit_code)
 
 
@@ -152,6 +159,8 @@ def _help() -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted."""
+    with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error
+        system_folder()
     words = sys.argv[1:] if arguments is None else arguments
     if arguments is None and words[:1] == ["fit"]:
         keep_all_freed_memory()
