@@ -77,10 +77,7 @@ EXAMPLES = (
 )
 """Commands to begin with."""
 
-SCENE = (
-    "folder with cameras, in a format that --help-all lists;",
-    "or photographs or a video; fit then finds the poses",
-)
+SCENE = ("folder with cameras, in a format that --help-all lists;", "or photographs or a video; fit then finds the poses")
 """Description of the positional argument."""
 
 

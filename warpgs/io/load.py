@@ -573,11 +573,5 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
         views, note = add_score_masks(views, masks, SceneFolder(bound, plain))
         more = (*more, note)
     return replace(
-        scene,
-        path=str(root),
-        format=reader.name,
-        views=tuple(views),
-        points=points,
-        normalization=n,
-        notes=(*notes, *more),
+        scene, path=str(root), format=reader.name, views=tuple(views), points=points, normalization=n, notes=(*notes, *more)
     )

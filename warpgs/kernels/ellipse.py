@@ -472,9 +472,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         h12 = at(v_projected, i, 3) * u22
         h22 = at(v_projected, i, 4) * u22
         V = real(-0.5) * vec3(
-            h11 * u11 * u11,
-            (h11 * u12 + h12 * u22) * u11,
-            (h11 * u12 + real(2.0) * h12 * u22) * u12 + h22 * u22 * u22,
+            h11 * u11 * u11, (h11 * u12 + h12 * u22) * u11, (h11 * u12 + real(2.0) * h12 * u22) * u12 + h22 * u22 * u22
         )
         if wp.static(antialiased):
             compensation = m.compensation(e)

@@ -124,14 +124,9 @@ def _lines(job: Json, folder: Path) -> Iterator[Json]:
 
 
 def find_model(
-    photographs: list[Photograph],
-    names: list[str],
-    kind: str,
-    folder: Path,
-    progress: Say,
-    threads: int = 0,
+    photographs: list[Photograph], names: list[str], kind: str, folder: Path, progress: Say, threads: int = 0,
     learned: bool = False,
-) -> Mapping:
+) -> Mapping:  # fmt: skip
     """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files."""
     result: Json | None = None
     for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores(), learned), folder):
