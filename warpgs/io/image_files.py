@@ -163,7 +163,7 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px] of a PNG, whose chunks must lie in the file: OpenCV takes the memory that each announces."""
+    """Return width and height [px] of a PNG. Its chunks must lie in the file, since OpenCV takes the memory they announce."""
     expect(len(data) >= 33 and data[12:16] == b"IHDR", "it has no header")
     expect(sum(kind == b"IHDR" for kind, _ in png_chunks(data)) == 1, "it has two headers")  # of maybe different sizes
     return struct.unpack_from(">II", data, 16)
