@@ -1,8 +1,9 @@
 """Edits of a finished model: filters and compression."""
 
+import itertools
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.limits import NEEDLE, ROUNDING, long_axes
 from warpgs.pipeline.model.table import truncated
 from warpgs.render.options import RasterizeOptions
-from warpgs.render.rasterize import rasterize
+from warpgs.render.rasterize import Render, rasterize
 from warpgs.scene import Box, Camera, Gaussians
 
 SEEN = 4 / 255
@@ -26,6 +27,25 @@ SEEN = 4 / 255
 its colour and what is behind: with less weight by less than 4 of 255 levels, even for white before black."""
 PROBES = 16
 """Least number of random images over all views for the sensitivities."""
+AT_ONCE = 2**21
+"""Gaussians or pixels of the views that are rendered at a time without a memory limit, about 64 bytes each."""
+
+
+def batch_of(cameras: Sequence[Camera]) -> Camera:
+    """Return cameras of one image size and model as one batch."""
+    first, stack = cameras[0], np.stack if isinstance(cameras[0].viewmat, np.ndarray) else torch.stack
+    distortion = None if first.distortion is None else stack([c.distortion for c in cameras])
+    return replace(first, viewmat=stack([c.viewmat for c in cameras]), K=stack([c.K for c in cameras]), distortion=distortion)
+
+
+def in_batches(gaussians: Gaussians, cameras: Iterable[Camera], options: RasterizeOptions) -> Iterator[Render]:
+    """Render cameras, neighbours of one image size and model in one call."""
+    for (width, height, _), same in itertools.groupby(cameras, lambda c: (c.width, c.height, c.model)):
+        left = [*same]
+        count = 1 if options.max_instances else max(1, AT_ONCE // max(len(gaussians), width * height))
+        while left:
+            yield rasterize(gaussians, batch_of(left[:count]), options)
+            left = left[count:]
 
 
 @torch.no_grad()
@@ -41,10 +61,9 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
     options = replace(options, contributions=True, sh_degree=0, rule=rule)
     maxima = gaussians.means.new_zeros(len(gaussians))
     views = torch.zeros_like(maxima, dtype=torch.int64)
-    for c in cameras:
-        weights = rasterize(gaussians, c, options).weight_maxima[0]
-        maxima = torch.maximum(maxima, weights)
-        views += weights >= SEEN
+    for render in in_batches(gaussians, cameras, options):
+        maxima = torch.maximum(maxima, render.weight_maxima.amax(0))
+        views += (render.weight_maxima >= SEEN).sum(0)
     return maxima, views
 
 

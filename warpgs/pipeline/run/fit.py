@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -418,12 +418,15 @@ def fit(
         )  # fmt: skip
         with section("set-up"):
             _settle(job, time_budget)
-        thread, stopped = beside.enter_context(ThreadPoolExecutor(1)), threading.Event()
+        threads, stopped = beside.enter_context(ThreadPoolExecutor(2)), threading.Event()
         beside.callback(stopped.set)
         views = itertools.takewhile(lambda _: not stopped.is_set(), read.views)
         # only now: a time budget is measured without another thread
-        hashed = thread.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
-        trainer, record, checks = _prepare(job, out if resume else None, hashed.result)
+        hashed = threads.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
+        compared = threads.submit(_compared, job, stopped)
+        trainer, record = _prepare(job, out if resume else None, hashed.result)
+        with section("photo checks"):
+            checks = compared.result()
         if own is not None and not resume:
             with section("writing"):
                 write_json(own / CONFIG, record)
@@ -491,8 +494,8 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
         raise KeyboardInterrupt(again) from e
 
 
-def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tuple[Trainer, dict[str, Any], list[PhotoCheck]]:
-    """Return the trainer, which continues the run ``resumed``, the record of the run, and checks of photographs."""
+def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tuple[Trainer, dict[str, Any]]:
+    """Return the trainer, which continues the run ``resumed``, and the record of the run."""
 
     def recorded() -> dict[str, Any]:
         job.scene = replace(job.scene, fingerprint=hashed())  # of the scene as it was read
@@ -512,14 +515,10 @@ def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tu
                 job.say(f"  all {state[1]['step']:,} steps are taken; only the images, scores and report are made again")
     if record is not None:
         check_equal(record, None if state is None else state[1].get("step"), job.ranks)
-    checks: list[PhotoCheck] = []
     with background_warmup(job.config, job.device) as ready:
         if job.other_models:
             models = " and ".join(job.other_models)
             job.notes.append(f"camera model {models}: views cannot be compared, so blur, exposure and coverage are not checked")
-        else:
-            with section("photo checks"):
-                checks = check_photos(in_threads(without_masked, (*job.train, *job.test)), job.progress)
         of = job.train, job.scene.points, job.config, job.device, job.scene.background
         with section("set-up"):
             trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
@@ -531,7 +530,17 @@ def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tu
         except DataError as e:
             raise DataError(f"{resumed}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
-    return trainer, record or recorded(), checks
+    return trainer, record or recorded()
+
+
+def _compared(job: FitJob, stopped: threading.Event) -> list[PhotoCheck]:
+    """Return the checks of all photographs, none for camera models whose views cannot be compared; end early once stopped."""
+
+    def going(_: str) -> None:
+        if stopped.is_set():
+            raise CancelledError
+
+    return [] if job.other_models else check_photos(in_threads(without_masked, (*job.train, *job.test)), going)
 
 
 def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[PhotoCheck]) -> FitResult:

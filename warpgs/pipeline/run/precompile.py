@@ -91,7 +91,8 @@ def compiled_ahead(*devices: torch.device, calls: bool = False) -> Iterator[list
     The threads begin no module after the block, which gets the kernels, block sizes and devices. A launch that needs a module
     waits for it or compiles it, and raises its error.
     """
-    jobs = [] if (cpu := torch.device("cpu")) in devices else [(scoring(), 1, cpu)]
+    on_cpu = sweep.best, scoring(), neighbours.bound_by_reach  # in fits on CUDA, too
+    jobs = [] if (cpu := torch.device("cpu")) in devices else [(kernel, 1, cpu) for kernel in on_cpu]
     for device, cuda in [(device, device.type == "cuda") for device in devices]:
         jobs += [(*job, device) for job in [*fit_kernels(cuda), *(call_kernels(cuda) if calls else ())]]
     later = AFTER_STEP if devices == (cpu,) and not calls else 0

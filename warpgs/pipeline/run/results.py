@@ -235,8 +235,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
     """Write images of some events, ``sampling/STEP.png``, in a thread during the block; yields a function that awaits them."""
     # Call the function before a checkpoint, since a fit that continues from it does not write earlier images. If an image
     # cannot be written, the fit continues, with one message in ``fit.messages``.
-    steps, strategy = shown_steps(fit.phases), fit.strategy
-    disparities = fit.disparities or [None] * len(names)
+    strategy, disparities = fit.strategy, fit.disparities or [None] * len(names)
     writing: list[Future[None]] = []
 
     def written() -> None:
@@ -256,18 +255,17 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
             fit.messages.append(f"an image of sampling events is missing from the report: {e}")
 
     def on_event(step: int, sampled: Sequence[SampledView]) -> None:
-        if step in steps:
-            # the thread must not use the device, since steps may be captured at that time
-            kept = [_on_host(d) for d in evenly_spaced(sampled, SHOWN)]
-            views = [replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
-            writing.append(thread.submit(write, step, views, kept))
+        # the thread must not use the device, since steps may be captured at that time
+        kept = [_on_host(d) for d in evenly_spaced(sampled, SHOWN)]
+        views = [replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
+        writing.append(thread.submit(write, step, views, kept))
 
     with ThreadPoolExecutor(1) as thread:
-        strategy.on_event = on_event
+        strategy.on_event, strategy.shown = on_event, shown_steps(fit.phases)
         try:
             yield written
         finally:
-            strategy.on_event = None
+            strategy.on_event, strategy.shown = None, ()
     written()
 
 

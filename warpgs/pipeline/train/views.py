@@ -12,6 +12,7 @@ import torch
 from warpgs.device import FLOAT, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.scores import OPAQUE
+from warpgs.pipeline.model.edit import batch_of
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.view_modules import ViewModule
 from warpgs.plugins import returned
@@ -239,13 +240,6 @@ class ViewStack:
     """Index of each view among all training views, int64, shape [V]."""
     alphas: Rows | None = None
     """Opacity of the subject, shape [V, H, W]; None if no training view has one."""
-
-
-def batch_of(cameras: Sequence[Camera]) -> Camera:
-    """Return cameras of one image size and model, on a device, as one batch."""
-    distortion = None if cameras[0].distortion is None else torch.stack([c.distortion for c in cameras])
-    viewmats, Ks = torch.stack([c.viewmat for c in cameras]), torch.stack([c.K for c in cameras])
-    return replace(cameras[0], viewmat=viewmats, K=Ks, distortion=distortion)
 
 
 def camera_at(cameras: Camera, i: int) -> Camera:

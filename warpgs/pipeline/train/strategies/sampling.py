@@ -1,8 +1,7 @@
 """Sampling: fine Gaussians are added behind pixels of the training views, in two layers, and protected for some steps."""
 
-import itertools
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, NamedTuple
@@ -13,13 +12,13 @@ from warpgs.constants import ALPHA_CUT
 from warpgs.device import FLOAT, SAMPLING, Needs, StepSizes
 from warpgs.geometry import back_project_tensors, logit
 from warpgs.kernels.update import Setting
-from warpgs.pipeline.model.edit import SEEN, coverage
+from warpgs.pipeline.model.edit import SEEN, coverage, in_batches
 from warpgs.pipeline.model.start import isotropic
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
 from warpgs.pipeline.train.strategies.clone_split import GradientGrowth
-from warpgs.pipeline.train.views import TrainingView, batch_of, half_size_camera
+from warpgs.pipeline.train.views import TrainingView, half_size_camera
 from warpgs.plugins import is_ours
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
@@ -32,9 +31,8 @@ NOT_SAMPLED = -(2**30)
 """Value of ``created_step`` in the coarse layer, whose Gaussians were not sampled."""
 MAX_VIEWS = 8
 """Largest number of views in which one event samples; of more views, a random subset is taken."""
-MAX_WEIGHED, WEIGHED_SIZE = 32, 2**21
-"""Largest number of views over which blending weights are summed to choose Gaussians for eviction; and, without a memory limit,
-of Gaussians or pixels of several views at a time, about 64 bytes each."""
+MAX_WEIGHED = 32
+"""Largest number of views over which blending weights are summed to choose Gaussians for eviction."""
 MIN_ALPHA, BORDER = 0.5, 2
 """Rendered opacity above which a pixel may receive a Gaussian, and width of the image border in which none is sampled [px]."""
 OPACITY = 0.1
@@ -109,9 +107,9 @@ class Rendered(NamedTuple):
     """A render of a view before an event, and the pixels that can be sampled."""
 
     rgb: torch.Tensor
-    """Rendered colours after the view modules of the fit, shape [H, W, 3]."""
+    """Rendered colours after the view modules of the fit, shape [H, W, 3]; those of the photograph if nothing reads them."""
     surface: torch.Tensor
-    """Rendered z-depth [u], shape [H, W]."""
+    """Rendered z-depth [u], shape [H, W]; the consistent depth if nothing reads it."""
     depth: torch.Tensor
     """Depth that Gaussians are placed at [u], shape [H, W]."""
     valid: torch.Tensor
@@ -165,13 +163,9 @@ def weight_sums(gaussians: Gaussians, cameras: list[Camera], options: RasterizeO
     """Return the sum of blending weights of each Gaussian over at most `MAX_WEIGHED` cameras, evenly spaced, shape [N]."""
     weigh = replace(options, contributions=True, sh_degree=0)
     total = torch.zeros(len(gaussians), device=gaussians.means.device, dtype=torch.float32)
-    for _, same in itertools.groupby(cameras[:: -(-len(cameras) // MAX_WEIGHED)], lambda c: (c.width, c.height, c.model)):
-        left = [*same]
-        at_once = 1 if options.max_instances else max(1, WEIGHED_SIZE // max(len(gaussians), left[0].width * left[0].height))
-        while left:
-            for weights in rasterize(gaussians, batch_of(left[:at_once]), weigh).weight_sums:
-                total += weights
-            left = left[at_once:]
+    for render in in_batches(gaussians, cameras[:: -(-len(cameras) // MAX_WEIGHED)], weigh):
+        for weights in render.weight_sums:
+            total += weights
     return total
 
 
@@ -231,7 +225,8 @@ class Sampling(Strategy):
         """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
         self._ahead: Future[Any] | None = None
         self.on_event: Callable[[int, list[SampledView]], None] | None = None
-        """Function that is called with the step and the samples of each view after each event."""
+        """Function that is called with the step and the samples of each view after the events at the steps ``shown``."""
+        self.shown: Collection[int] = ()
 
     def before_event(self, views: Mapping[int, TrainingView], rendered: Mapping[int, Rendered]) -> None:
         """Prepare an event in some views, by their index among the training views."""
@@ -244,9 +239,11 @@ class Sampling(Strategy):
         """Return the pixels that may be sampled, of the ``valid`` ones [H, W], and the quantile that was used."""
         return valid, 0.0
 
-    def render_before(self, view: TrainingView) -> Rendered:
-        """Render a view for an event, and find the depths for Gaussians at its pixels."""
-        t = self.context
+    def render_before(self, view: TrainingView, reads: bool) -> Rendered:
+        """Return depths for Gaussians in a view; render it if an event ``reads`` colours, or if depth is not known."""
+        t, known = self.context, view.consistent
+        if known is not None and self.consistent and self.gated and not reads:
+            return Rendered(view.image, known, known, valid_pixels((known > 0).float(), known, view.countable))
         render = rasterize(t.gaussians, view.camera, t.render_options())
         depth, alpha = render.depth, render.alpha
         if self.consistent and view.consistent is not None:
@@ -264,7 +261,8 @@ class Sampling(Strategy):
         t = self.context
         draws = self._draws({i: v.image.shape[:2] for i, v in views.items()})
         numbers, sampled, rows = next(draws), [], []
-        rendered = {i: self.render_before(views[i]) for i in numbers}
+        reads = self.scored or step in self.shown or not is_ours(type(self))
+        rendered = {i: self.render_before(views[i], reads) for i in numbers}
         self.before_event({i: views[i] for i in numbers}, rendered)
         for i, r in rendered.items():
             view, wanted = views[i], max(1, round(fraction * r.valid.numel()))
@@ -391,7 +389,7 @@ class Sampling(Strategy):
             yield change
             quantiles = [v.quantile for v in sampled]
             self.events.append({"step": step, "added": len(change.parents), "evicted": evicted, "quantiles": quantiles})
-            if self.on_event is not None:
+            if self.on_event is not None and step in self.shown:
                 self.on_event(step, sampled)
 
     def prunes(self, step: int) -> bool:
