@@ -313,6 +313,13 @@ def test_fine_gaussians_stand_at_confirmed_depths(gated):
     assert len(z) == len(columns) > 50
     assert torch.allclose(z[columns < 20], torch.tensor(1.25), atol=1e-4)
     assert bool((columns >= 20).any()) != gated and not torch.allclose(z[columns >= 20].mean(), torch.tensor(1.25), atol=0.05)
+    # a render that nothing reads is not made, and the samples stay the same
+    assert torch.equal(sampled[0].rendered, view.image) == gated
+    again = fitted(steps=8)
+    again.strategy.gated, again.strategy.on_event = gated, lambda step, views: None
+    same, _, shown = event_of(again, [dataclasses.replace(again.views[0], consistent=consistent)], 9, 0.2, 50)
+    assert torch.equal(shown[0].at, sampled[0].at) and not torch.equal(shown[0].rendered, view.image)
+    assert all(torch.equal(same.added[n], rows) for n, rows in change.added.items())
 
 
 def test_few_views_have_dropout_and_a_sweep():

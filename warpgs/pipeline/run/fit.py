@@ -426,6 +426,8 @@ def fit(
         compared = threads.submit(_compared, job, stopped)
         trainer, record = _prepare(job, out if resume else None, hashed.result)
         with section("photo checks"):
+            if not compared.done():
+                progress("comparing photographs")
             checks = compared.result()
         if own is not None and not resume:
             with section("writing"):

@@ -265,7 +265,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
         try:
             yield written
         finally:
-            strategy.on_event, strategy.shown = None, ()
+            strategy.on_event = strategy.shown = None
     written()
 
 

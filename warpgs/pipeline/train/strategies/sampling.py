@@ -225,8 +225,8 @@ class Sampling(Strategy):
         """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
         self._ahead: Future[Any] | None = None
         self.on_event: Callable[[int, list[SampledView]], None] | None = None
-        """Function that is called with the step and the samples of each view after the events at the steps ``shown``."""
-        self.shown: Collection[int] = ()
+        """Function that is called with the step and the samples of each view after events, at the steps ``shown`` if given."""
+        self.shown: Collection[int] | None = None
 
     def before_event(self, views: Mapping[int, TrainingView], rendered: Mapping[int, Rendered]) -> None:
         """Prepare an event in some views, by their index among the training views."""
@@ -252,6 +252,10 @@ class Sampling(Strategy):
             alpha = torch.where(known, 1.0, 0.0 if self.gated else alpha)
         return Rendered(view.seen(render.rgb), render.depth, depth, valid_pixels(alpha, depth, view.countable))
 
+    def _shows(self, step: int) -> bool:
+        """Return whether the event after a step is shown."""
+        return self.on_event is not None and (self.shown is None or step in self.shown)
+
     @torch.no_grad()
     def sample(
         self, step: int, views: Mapping[int, TrainingView], fraction: float, max_fraction: float
@@ -261,7 +265,7 @@ class Sampling(Strategy):
         t = self.context
         draws = self._draws({i: v.image.shape[:2] for i, v in views.items()})
         numbers, sampled, rows = next(draws), [], []
-        reads = self.scored or step in self.shown or not is_ours(type(self))
+        reads = self.scored or self._shows(step) or not is_ours(type(self))
         rendered = {i: self.render_before(views[i], reads) for i in numbers}
         self.before_event({i: views[i] for i in numbers}, rendered)
         for i, r in rendered.items():
@@ -389,7 +393,7 @@ class Sampling(Strategy):
             yield change
             quantiles = [v.quantile for v in sampled]
             self.events.append({"step": step, "added": len(change.parents), "evicted": evicted, "quantiles": quantiles})
-            if self.on_event is not None and step in self.shown:
+            if self.on_event is not None and self._shows(step):
                 self.on_event(step, sampled)
 
     def prunes(self, step: int) -> bool:
