@@ -526,7 +526,7 @@ CPU_TIMES = 0.002, 6.8e-8, 3.3e-7, 1.3e-8
 harmonics of a Gaussian [s] (docs/decisions/025-time-on-a-cpu.md)."""
 GAUSSIANS_SHARE = 0.75
 """Largest fraction of the mean step that Gaussians take where the time limit on a CPU shortens a fit."""
-EVENT_TIMES = 1.0, 0.6, 0.8
+EVENT_TIMES = 0.2, 0.6, 0.8
 """Time of an event, in steps: for each view that is sampled, for each view that ranks Gaussians for eviction, and for each view
 that shows which Gaussians to remove."""
 GROWN, SATURATED = 25.0, 0.2
