@@ -40,7 +40,6 @@ def scene(batch=(), dtype=torch.float32, seed=0):
 
 
 def on(device, values):
-    """Values by name, the tensors on a device."""
     return {name: value.to(device) if isinstance(value, torch.Tensor) else value for name, value in values.items()}
 
 
@@ -59,7 +58,6 @@ def dense(given, i, colors, degree):
     [("RGB", "views"), ("RGB+D", "extra"), ("RGB+ED", "harmonics"), ("D", "none"), ("ED", "covars"), ("RGB", "covars")],
 )
 def test_batches_equal_the_dense_reference(mode, form):
-    """Images, alphas and extra signals of a batch, with their gradients, are those of each scene in float64."""
     given, degree = scene((2, 1), torch.float64), 2 if form == "harmonics" else None
     shape = {"views": (2, 1, VIEWS, COUNT, 5), "harmonics": (COUNT, 9, 3)}.get(form, (2, 1, COUNT, 3))
     generator = torch.Generator().manual_seed(1)
@@ -255,7 +253,6 @@ def test_arguments_of_gsplat_become_ours(arguments, camera_options, options):
     ],
 )
 def test_other_arguments_are_refused_by_name(arguments, message):
-    """With the reason; the error is of the kinds that gsplat raises."""
     with pytest.raises(ValueError, match=message) as caught:
         gsplat.rasterization(**scene() | arguments)
     if "does not support" in str(caught.value):

@@ -16,7 +16,6 @@ FIELDS = {"2023": {"debug": False}, "2024": {"debug": False, "antialiasing": Tru
 
 
 def pose():
-    """A camera that is turned and moved [4, 4]."""
     turned = torch.eye(4)
     turned[:3, :3] = rotations(torch.tensor([[1.0, 0.1, -0.2, 0.05]]))[0]
     turned[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
@@ -57,7 +56,6 @@ def scene(form="harmonics"):
 
 
 def on(device, values):
-    """Values by name, the tensors as leaves on a device."""
     return {n: v.detach().to(device).requires_grad_(v.requires_grad) if isinstance(v, torch.Tensor) else v for n, v in values}
 
 

@@ -47,7 +47,6 @@ def test_another_model_renders(device, dtype, max_instances):
 
 
 def test_unknown_models_and_coefficients_of_another_number_are_refused():
-    """The error names the models there are, and both numbers; coefficients have no gradients."""
     cam = dataclasses.replace(camera(dtype=torch.float32), model="fish")
     message = "unknown camera model 'fish'; choose one of fisheye, opencv, orthographic, pinhole.* or import the file"
     with pytest.raises(UsageError, match=message):
@@ -70,7 +69,6 @@ def test_unknown_models_and_coefficients_of_another_number_are_refused():
 
 
 def projected(gaussians: Gaussians, cam: Camera, rule=SMOOTH, degree: int = 0) -> torch.Tensor:
-    """Return the projected Gaussians [C, N, 12] of a batch of cameras."""
     return project(
         *gaussians.tensors().values(), cam.viewmat, cam.K, width=cam.width, height=cam.height, degree=degree, rule=rule,
         camera_model=cam.model, distortion=cam.distortion,
@@ -78,7 +76,6 @@ def projected(gaussians: Gaussians, cam: Camera, rule=SMOOTH, degree: int = 0) -
 
 
 def at(positions, dtype=torch.float64, device="cpu") -> Gaussians:
-    """Return small round Gaussians at positions [N, 3]."""
     means = torch.as_tensor(np.array(positions), dtype=dtype, device=device)
     count = len(means)
     quats = means.new_tensor([1.0, 0, 0, 0]).expand(count, 4).contiguous()
@@ -95,7 +92,6 @@ def directions(largest: float, count: int = 60) -> np.ndarray:
 
 @pytest.mark.parametrize("model", [*LENSES, NAME])
 def test_gradcheck(model, device):
-    """Finite differences agree for Gaussians, poses and intrinsics; two Gaussians lie beyond the margin of the image."""
     gaussians = leaves(hand_placed(device=device))
     if model == NAME:  # each camera has its own coefficients
         cam = parallel(cameras=2, device=device)
@@ -113,7 +109,6 @@ def test_gradcheck(model, device):
 
 
 def test_gradcheck_of_a_fisheye_near_its_axis_and_behind(device):
-    """The series near the axis, its end at a tangent of 0.2, and angles up to 150 degrees."""
     angles = np.radians([0.0, 1e-5, 0.5, 11.30, 11.32, 60, 89.9, 90.1, 150])
     positions = np.stack([0.6 * np.sin(angles), 0.8 * np.sin(angles), np.cos(angles)], 1) * 2
     cam = lens_camera("fisheye", cameras=1, device=device)
@@ -131,7 +126,6 @@ def test_gradcheck_of_a_fisheye_near_its_axis_and_behind(device):
 
 @pytest.mark.parametrize("model, largest", [("opencv", 50), ("fisheye", 80)])
 def test_pixels_are_those_of_opencv(model, largest, dtype):
-    """`cv2.projectPoints` and `cv2.fisheye.projectPoints`; the depth of a fisheye is the distance."""
     positions, cam = directions(largest), lens_camera(model, width=400, height=300, cameras=1)
     wanted = opencv_pixels(model, COEFFICIENTS[model], cam.K[0].numpy(), positions)
     plane = geometry.to_plane(model, np.array(COEFFICIENTS[model]), positions)
@@ -145,7 +139,6 @@ def test_pixels_are_those_of_opencv(model, largest, dtype):
 
 
 def test_a_lens_without_distortion_is_a_pinhole(device):
-    """The same ellipses, also where the Jacobian is clamped; and the same gradients."""
     pinhole = camera(cameras=2, device=device)
     opencv = dataclasses.replace(pinhole, model="opencv", distortion=pinhole.K.new_zeros(2, 8))
     found = []
@@ -219,7 +212,6 @@ def test_nothing_is_drawn_beyond_the_rim(name, dtype):
 
 @pytest.mark.parametrize("model", LENSES)
 def test_near_far_and_what_is_no_number(model):
-    """Positions nearer or farther than the limits, NaN and infinity are not drawn; coefficients that are NaN draw nothing."""
     cam = lens_camera(model, cameras=1, dtype=torch.float32)
     rule = dataclasses.replace(RULES["exact"], alpha_cut=0.0, transmittance_stop=0.0)
     wrong = [[0, 0, 0.5 * rule.near], [0, 0, 2e10], [0, 0, math.nan], [math.nan, 0, 2], [math.inf, 0, 2], [0, 0, math.inf]]
@@ -234,7 +226,6 @@ def test_near_far_and_what_is_no_number(model):
 
 @pytest.mark.parametrize("model", LENSES)
 def test_extremes_give_finite_numbers(model):
-    """Positions, scales and coefficients over all magnitudes: whatever is drawn is finite, and so are its gradients."""
     generator = torch.Generator().manual_seed(1)
     count = 20000
 
@@ -265,7 +256,6 @@ def test_extremes_give_finite_numbers(model):
 
 @pytest.mark.parametrize("model, largest", [("orthographic", 60), ("opencv", 45), ("fisheye", 110)])
 def test_the_way_back_from_the_plane(model, largest):
-    """Positions come back from their points in the plane, as arrays and tensors; a point beyond the rim gives NaN."""
     positions, lens = directions(largest), np.array(COEFFICIENTS[model])
     plane = geometry.to_plane(model, lens, positions)
     depth = geometry.depth_of(model, positions)[:, None]

@@ -14,7 +14,6 @@ COUNT = 4000
 
 @functools.cache
 def make_probe():
-    """A kernel that calls the functions in float64, one case an item."""
     s, f = ellipse.make_spans(wp.float64), falloff.make_functions(wp.float64)
     vec3 = wp.types.vector(3, wp.float64)
 
@@ -73,7 +72,6 @@ def ellipses(origin=16, size=53, tile_size=16, far=1.0) -> torch.Tensor:
 
 
 def margin_of(center, half):
-    """Return the margin that the functions promise for rounding [px]."""
     return 0.01 + 2e-6 * (center.abs() + half)
 
 
@@ -88,7 +86,6 @@ def tiles_of(low, high, origin, size, tile_size):
 @pytest.mark.parametrize("far", [1.0, 1e5])
 @pytest.mark.parametrize("tile_size", [1, 16])
 def test_rows_of_tiles_are_those_of_the_box(device, tile_size, far):
-    """The rows are those that the box and its margin touch within the window, and no others."""
     cases = ellipses(far=far)
     found = probe(cases, device, tile_size=tile_size)[:, :2]
     low, high = cases[:, 1] - cases[:, 7], cases[:, 1] + cases[:, 7]
@@ -123,7 +120,6 @@ def test_strips_are_those_of_the_ellipse(device, far):
 @pytest.mark.parametrize("far", [1.0, 1e4])
 @pytest.mark.parametrize("tile_size", [1, 16])
 def test_columns_of_tiles_are_those_of_the_ellipse(device, tile_size, far):
-    """The columns of a row of tiles, widened by its margin, are those that the ellipse touches, and no others."""
     cases = ellipses(far=far, tile_size=tile_size)
     mx, my, u11, u12, u22, reach, half_width, half_height, row = (t[:, None] for t in cases.unbind(-1))
     slack = margin_of(my, half_height)
@@ -161,7 +157,6 @@ def test_columns_of_the_box_where_there_is_no_reach(device, far):
 
 @functools.cache
 def make_reach():
-    """A kernel for `reach_of` and for the falloff of both scalar types."""
     s = ellipse.make_spans(wp.float64)
     single = falloff.make_falloff(wp.float32)
 

@@ -39,13 +39,11 @@ class Guarded(TorchDispatchMode):
         return inner
 
     def intact(self) -> bool:
-        """Return whether all guard bytes are unchanged."""
         ends = [end for memory in self.kept for end in (memory[:GUARD], memory[-GUARD:])]
         return all(bool((end.isnan() if end.is_floating_point() else end == self.whole).all()) for end in ends)
 
 
 def rendering(device, cameras, deterministic=True, degree=1):
-    """Return all results of a render, and the gradients of Gaussians, cameras and projected Gaussians."""
     g = leaves(cloud(60, device=device, degree=degree))
     cam = camera(200, 30, cameras=cameras, dtype=torch.float32, device=device)
     size, side = {"width": 200, "height": 30, "rule": RULES["exact"]}, {"tile_size": 8}
@@ -67,7 +65,6 @@ def rendering(device, cameras, deterministic=True, degree=1):
 
 
 def similarity(device, cameras):
-    """Return the map, the sums, and their gradients."""
     generator = torch.Generator().manual_seed(0)
     found = []
     for height, width in ((33, 47), (8, 11), (16, 16)):
@@ -95,7 +92,6 @@ def steps(device, number):
     ("work", "guarded"), [(rendering, 20), (functools.partial(rendering, degree=4), 20), (similarity, 20), (steps, 4)]
 )
 def test_nothing_beside_a_tensor_is_written_or_used(device, work, guarded, number, whole):
-    """The bits are those without guard bytes, whatever these hold, and the guard bytes do not change."""
     wanted = work(device, number)
     with Guarded(whole) as guards:
         found = work(device, number)

@@ -1,4 +1,4 @@
-"""Launches cover every item once and check their arguments; modules load once; an arena gives tensors at the same places."""
+"""Launches cover every item once and check their arguments; modules load once."""
 
 import contextlib
 import dataclasses
@@ -21,15 +21,13 @@ from tests.gaussians import camera, cloud
 from tests.kernels.test_guard_bytes import rendering, similarity
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch, native
-from warpgs.kernels.graphs import ALIGNMENT, TORCH, Arena, CapturedGraph, SizingAllocator, fetch, part
+from warpgs.kernels.graphs import CapturedGraph, fetch
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.update import Setting, opacity_dropout
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 CPU = torch.device("cpu")
-
-# Launches are cut into ranges that cover every item once; arguments are checked by name.
 
 
 @wp.kernel(enable_backward=False)
@@ -38,14 +36,12 @@ def mark(
     # outputs
     visits: wp.array(dtype=int), firsts: wp.array(dtype=int),
 ):  # fmt: skip
-    """Count the visits of an item, and tell where its range begins."""
     i = begin + wp.tid()
     visits[i] = visits[i] + 1
     firsts[i] = begin
 
 
 def marked(count: int = 30_000, **options) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the visits of each item, and the begin of its range."""
     visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
     launch.launch(mark, count, [visits, firsts], CPU, **options)
     return visits, firsts
@@ -71,7 +67,6 @@ def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges)
 
 
 def everything():
-    """Return the results of every float32 kernel for a CPU, with gradients."""
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
@@ -110,29 +105,18 @@ def test_the_device_that_is_current_stays_so(monkeypatch, several):
     """Warp leaves the one current that it worked on: where there are several, launches and its own work stand in a guard."""
     events, device = [], torch.device("cuda", 1)
 
-    class Guard:
-        def __init__(self, where):
-            self.where = where
+    @contextlib.contextmanager
+    def guard(where):
+        events.append(("enter", where))
+        yield
+        events.append("exit")
 
-        def __enter__(self):
-            events.append(("enter", self.where))
-
-        def __exit__(self, *_):
-            events.append("exit")
-
-    class Noted:
-        def launch(self, *_):
-            events.append("launch")
-
-        def set_stream(self, stream, sync):
-            events.append(stream)
-
-    Noted.stream = "before"
-    monkeypatch.setattr(launch, "_several_devices", lambda: several)
-    monkeypatch.setattr(torch.cuda, "device", Guard)
-    monkeypatch.setattr(launch, "_recorded", lambda *_: Noted())
-    monkeypatch.setattr(launch, "warp_stream", lambda _: "ours")
-    monkeypatch.setattr(launch, "warp_device", lambda _: Noted())
+    noted = SimpleNamespace(stream="before", launch=lambda *_: events.append("launch"))
+    noted.set_stream = lambda stream, sync: events.append(stream)
+    monkeypatch.setattr(torch.cuda, "device", guard)
+    own = {"_several_devices": several, "_recorded": noted, "warp_stream": "ours", "warp_device": noted}
+    for name, value in own.items():
+        monkeypatch.setattr(launch, name, lambda *_, value=value: value)
     launch.launch(mark, 1, [None, None], device)
     with launch.stream_of(device):
         events.append("sort")
@@ -142,8 +126,6 @@ def test_the_device_that_is_current_stays_so(monkeypatch, several):
 
 @wp.struct
 class Pair:
-    """Two numbers."""
-
     count: wp.int32
     step: wp.float64
 
@@ -156,8 +138,6 @@ def add_turned(begin: int, pair: Pair, turn: wp.mat33d, shift: wp.vec3d, found: 
 
 
 def test_a_recorded_launch_takes_structs_vectors_and_matrices_by_value(device):
-    """Each launch sees the values that it is given, and changes no struct: callers keep them."""
-
     def pair(count, step):
         made = Pair()
         made.count, made.step = count, step
@@ -315,7 +295,6 @@ def test_a_second_interrupt_waits_too(monkeypatch):
 
 
 def test_an_error_of_another_thread_is_raised(monkeypatch):
-    """A launch that failed there is not taken for a whole one."""
     work, failed = launch._SharedLaunch.work, threading.Event()
 
     def fails(shared):
@@ -386,7 +365,6 @@ def tell_apart(
 ):
     i = begin + wp.tid()
     found[i] = wp.float32(table.shape[0] * 100 + table.shape[1]) + 1000.0 * table[i, 1] + 1000000.0 * numbers[i]
-    found[i] = wp.float32(table.shape[0] * 100 + table.shape[1]) + 1000.0 * table[i, 1] + 1000000.0 * numbers[i]
 
 
 @wp.kernel(enable_backward=False)
@@ -418,7 +396,6 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
 
 
 def test_check_names_what_disagrees():
-    """Each rule of `check` alone, and the sizes where all hold."""
     a, b = torch.zeros(2, 3), torch.zeros(4, 2)
     assert launch.check(a=(a, "N 3"), b=(b, "K N")) == {"N": 2, "K": 4}
     with pytest.raises(TypeError, match="a must be a torch tensor, not list"):
@@ -434,40 +411,6 @@ def test_check_names_what_disagrees():
             launch.check(a=(a, pattern))
     with pytest.raises(ValueError, match=r"b must have shape \[N, 2\] \(N=2\), not \[4, 2\]"):
         launch.check(a=(a, "N 3"), b=(b, "N 2"))
-
-
-# Allocators: an arena gives a function its tensors again, apart, aligned, at the same places each time.
-
-BYTE = torch.empty(0, dtype=torch.uint8)
-
-
-def ask(allocator):
-    """Ask for two output, three saved and two workspace tensors; one of each kind has an odd size."""
-    outputs = [allocator.output((3, 5), torch.float32, CPU), allocator.output((7,), torch.int32, CPU)]
-    saved = [allocator.saved(s, t, CPU) for s, t in (((11,), torch.int64), ((0,), torch.float32), ((2, 33), torch.float32))]
-    return outputs, saved, [allocator.workspace((1,), torch.int32, CPU), allocator.workspace((2, 3, 4), torch.float64, CPU)]
-
-
-def test_an_arena_gives_the_same_shapes_and_each_its_own_memory():
-    """A write to one tensor changes no other; saved ones are found again, at multiples of ALIGNMENT, in any such block."""
-    sizes = SizingAllocator()
-    wanted = [[(tuple(t.shape), t.dtype) for t in kind] for kind in ask(sizes)]
-    arena, second = Arena(sizes, BYTE), Arena(sizes, BYTE)
-    outputs, saved, workspace = found = ask(arena)
-    for each in (found, ask(TORCH)):
-        assert [[(tuple(t.shape), t.dtype) for t in kind] for kind in each] == wanted
-    every = [t for kind in found for t in kind]
-    for number, t in enumerate(every):
-        t.fill_(number)
-    assert all(bool((t == number).all()) for number, t in enumerate(every))
-    assert all(a is b for a, b in zip(arena.outputs, outputs, strict=True))
-    assert arena.addresses() == tuple(t.data_ptr() for t in (*outputs, saved[0], workspace[0])) != second.addresses()
-    places = [arena.place(t) for t in saved]
-    assert all(begin % ALIGNMENT == 0 for begin, _, _ in places) and len({begin for begin, _, _ in places}) >= 2
-    _, saved, _ = ask(second)
-    for number, t in enumerate(saved):
-        t.fill_(number + 1)
-    assert all(torch.equal(part(second.block, *place), t) for place, t in zip(places, saved, strict=True))
 
 
 def test_addresses_are_looked_up_when_the_kernel_runs(device):
@@ -530,7 +473,6 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_two_processes_compile_a_module_once(cache):
-    """The other process waits for the one that has the lock, finds the compiled module, and runs it."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "CUDA_VISIBLE_DEVICES": ""}
     name, cpu = load_module_mark.module.get_module_identifier(1), wp.get_device("cpu")
     (cache / "locks").mkdir(parents=True)
@@ -572,16 +514,7 @@ def test_a_module_has_its_name_whatever_was_compiled_before(cache, monkeypatch, 
     assert native.module_name(second_of_two.module, 1) == name
 
 
-def test_a_kernel_for_the_cpu_is_compiled_in_one_form(cache):
-    """Only for arrays without gaps; Warp would also compile the form for others."""
-    load_module_mark.module.unload()
-    native.load_module(load_module_mark.module, wp.get_device("cpu"), 1)
-    text = next(cache.rglob("*.cpp")).read_text("utf-8")
-    assert "_forward_tasks<true>(dim" in text and "_tasks<false>" not in text
-
-
 def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
-    """Neither the second launch nor any later one opens a file."""
     seen = torch.zeros(3, dtype=torch.int32)
     for _ in range(2):
         launch.launch(load_module_mark, 3, [seen], torch.device("cpu"))
@@ -635,8 +568,6 @@ def test_a_long_wait_for_modules_is_announced_once(cache, monkeypatch):
 
 
 class Later:
-    """A module that is named and loaded as Warp's are; ``load`` does it."""
-
     def __init__(self, name, flags, events, load):
         self.name, self.options, self.events, self.own_load = name, {"cpu_compiler_flags": flags}, events, load
 

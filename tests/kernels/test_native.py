@@ -1,10 +1,8 @@
-"""CUDA text: where it lies, that it compiles without a GPU, and the contracts between its bodies."""
+"""CUDA text: it compiles without a GPU; contracts between its bodies: items dealt, tiles ordered, blocks left out."""
 
-import ast
 import functools
 import itertools
 import math
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -15,12 +13,10 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import ALPHA_CUT
 from warpgs.kernels import blend, blend_cuda, launch, native, project_cuda, walk
 from warpgs.kernels.cameras import CAMERA_MODELS
-from warpgs.kernels.native import FOLDER, source
+from warpgs.kernels.native import source
 from warpgs.pipeline.run.precompile import fit_kernels
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-
-# Contracts between the CUDA bodies: items dealt, tiles ordered, blocks left out, chunks of one size for both passes.
 
 CUDA = torch.device("cuda", 0)
 
@@ -52,7 +48,6 @@ def test_long_lists_come_first(count):
 
 @functools.cache
 def small_kernels() -> SimpleNamespace:
-    """A kernel for each function, and one for the test of a block of pixels."""
     numbers = {"SIDE": 16, "STATE": 5, "WARPS": 2, "STRIDE": 12, "SCALE": blend_cuda.SCALE}
 
     @wp.func_native(
@@ -139,14 +134,6 @@ def test_no_block_that_draws_is_left_out(longest, corner):
 
 
 @pytest.mark.cuda
-def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
-    """Both passes take the chunk from the same function."""
-    sizes = (4096, 4097, 16384, 16385)
-    assert [blend_cuda.chunk_of(tiles, True) for tiles in sizes] == [64, 128, 128, 256]
-    assert [blend_cuda.chunk_of(tiles, False) for tiles in sizes] == [128, 128, 128, 256]
-
-
-@pytest.mark.cuda
 def test_gradients_agree_for_every_chunk(monkeypatch):
     """Lists that are longer than the largest chunk, begun anywhere; images have the same bits, gradients differ by rounding."""
     gaussians = leaves(cloud(3000, torch.float32, CUDA))
@@ -219,7 +206,6 @@ def test_a_fit_compiles_no_module_and_no_header_twice():
 
 @pytest.mark.slow
 def test_cuda_text_compiles(tmp_path):
-    """Each module, to PTX."""
     wp.init()
     if wp.get_cuda_supported_archs() == []:
         pytest.skip("this build of Warp has no NVRTC")
@@ -227,35 +213,3 @@ def test_cuda_text_compiles(tmp_path):
     assert len(found) > 20
     for module in found.values():
         wp.compile_aot_module(module, arch=ARCHITECTURE, use_ptx=True, module_dir=str(tmp_path))
-
-
-# CUDA text: it lies in files of one folder, is read by one function, and is part of what is installed.
-
-ROOT = Path(__file__).parents[2]
-FILES = {p.name for p in (ROOT / "warpgs/kernels/cuda").iterdir()}
-
-
-def native_bodies():
-    """Return file and expression of the CUDA body of each native function of the package."""
-    for path in sorted((ROOT / "warpgs").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("wp.func_native", "cuda_kernel"):
-                yield path.name, node.args[0]
-
-
-def test_cuda_text_comes_from_files(tmp_path):
-    """Every body comes from a file, and every file is read by name or included; whole words alone become numbers."""
-    bodies = list(native_bodies())
-    assert len(bodies) >= 20
-    others = [f"{file}: {ast.unparse(body)}" for file, body in bodies if not isinstance(body, ast.Call)]
-    assert others == ["native.py: text"]  # of `cuda_kernel` itself, whose callers are among these
-    bodies = [(file, body) for file, body in bodies if isinstance(body, ast.Call)]
-    assert {ast.unparse(body.func) for _, body in bodies} == {"source", "_source"}
-    named = {body.args[0].value for _, body in bodies if ast.unparse(body.func) == "source"}
-    named |= {f"blend_{body.args[0].value}.cu" for _, body in bodies if ast.unparse(body.func) == "_source"}
-    text = "".join((FOLDER / name).read_text("utf-8") for name in named)
-    assert {name for name in FILES if name in named or f'#include "{name}"' in text} == FILES
-    (tmp_path / "body.cu").write_text('#include "blend_common.cu"\nint SIDES = SIDE;\n')
-    text = source(str(tmp_path / "body.cu"), SIDE=8)
-    assert text.startswith("// Declarations") and "WIDE = 8 / 8" in text and text.endswith("int SIDES = 8;\n")
-    assert "#include" not in text

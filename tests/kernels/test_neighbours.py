@@ -13,13 +13,10 @@ from warpgs.kernels.neighbours import SMALLEST, camera_reach, mean_square_distan
 from warpgs.pipeline.model.limits import camera_rows
 from warpgs.scene import Camera
 
-# Nearest-neighbour distances against all pairs.
-
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 33, 1500])
 @pytest.mark.parametrize("k", [1, 3, 8])
 def test_equal_all_pairs(device, dtype, count, k):
-    """Exact for every size around the box size, and where there are fewer points than neighbours."""
     generator = torch.Generator().manual_seed(count)
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64).to(dtype)
     found = mean_square_distances(points.to(device), k).cpu()
@@ -52,7 +49,6 @@ def test_clusters_lines_and_duplicates(device):
 
 
 def test_bad_input_is_refused():
-    """NaN positions, a wrong shape and an impossible k are errors."""
     with pytest.raises(ValueError, match="non-finite"):
         mean_square_distances(torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]]))
     with pytest.raises(ValueError, match="points"):
@@ -67,7 +63,6 @@ def test_bad_input_is_refused():
 
 @pytest.mark.parametrize("cameras", [1, 3, 32])
 def test_it_is_the_fraction_of_the_distance_to_the_nearest(device, cameras):
-    """Near and far ones, within a rounding of float32."""
     generator = torch.Generator().manual_seed(cameras)
     means = torch.randn(1000, 3, generator=generator) * torch.logspace(-3, 6, 1000)[:, None]
     centers = torch.randn(cameras, 3, generator=generator)
@@ -77,8 +72,6 @@ def test_it_is_the_fraction_of_the_distance_to_the_nearest(device, cameras):
 
 
 # Sizes of a pixel at Gaussians, against angles and depths in float64.
-
-CPU = torch.device("cpu")
 
 
 def rows(count: int, fisheye: float = 0.3) -> torch.Tensor:
@@ -125,7 +118,6 @@ def test_a_row_says_what_a_camera_sees(device):
 
 
 def test_sizes_at_a_camera_and_without_gaussians(device):
-    """The smallest size; nothing from nothing; a NaN is seen by none."""
     center = torch.tensor([[1.0, 2.0, 3.0]], device=device)
     assert float(camera_reach(center, center, 0.5)) == pytest.approx(math.log(SMALLEST))
     assert camera_reach(center[:0], center, 0.5).shape == (0,)

@@ -37,7 +37,6 @@ def test_maps_sums_and_gradients_equal_the_convolution(device, dtype, height, wi
 
 
 def test_gradcheck_and_batches(device):
-    """Finite differences agree with the backward kernels, of the map and of sums over a batch, which has its images' bits."""
     image, target = images(7, 9, device=device)
     assert torch.autograd.gradcheck(lambda a: ssim(a, target), [image.requires_grad_()], eps=1e-6, atol=1e-8, rtol=1e-5)
     image, target = (torch.stack([t, t.flip(0)]) for t in images(10, 9, device=device))
@@ -48,7 +47,6 @@ def test_gradcheck_and_batches(device):
 
 
 def test_bad_input_names_the_argument():
-    """Shapes that disagree are refused; a type of 8 bits names the divisor."""
     a, b = images(8, 9)
     with pytest.raises(TypeError, match=r"image must be float32 or float64, .* image\.float\(\) / 255 converts it"):
         ssim((255 * a).byte(), (255 * b).byte())

@@ -35,14 +35,12 @@ def test_costs_are_those_of_opencv(size):
 
 
 def test_best_planes_are_those_of_numpy():
-    """Ties go to the first plane, ends are moved inwards, and planes past the last do not count."""
     inverses = np.linspace(0.1, 0.5, 9)
     costs = np.random.default_rng(2).integers(0, 9, (6, 5, 16)).astype(np.int16)
     assert np.array_equal(best_inverses(torch.from_numpy(costs), inverses), best_inverse(costs[..., :9], inverses))
 
 
 def problem(shape: tuple[int, int, int], seed: int = 0, largest: int = 4096):
-    """Random costs and limits."""
     g = np.random.default_rng(seed)
     height, width, _ = shape
     limits = [g.integers(0, 2000, s).astype(np.int32) for s in ((height - 1, width), (height, width - 1))]
@@ -56,7 +54,6 @@ def computed(device, costs, down, across, small) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [(1, 7, 3), (7, 1, 3), (3, 4, 1), (40, 33, 17), (1, 1, 4), (5, 4, 70)])
 def test_equal_to_the_definition(device, shape):
-    """The sums agree to the last unit, also for one row, one column and one plane, and for costs in another order of memory."""
     costs, down, across = problem(shape)
     wanted = defined(costs, down, across, 123)
     assert np.array_equal(computed(device, costs, down, across, 123), wanted)

@@ -17,12 +17,10 @@ BOUND = {torch.float32: 2e-4, torch.float64: 1e-10}
 
 
 def empty(shape, dtype, device):
-    """Distances and weights of a grid that no view has seen."""
     return [torch.zeros(shape, dtype=dtype, device=device) for _ in range(2)]
 
 
 def cameras(count=2):
-    """Return numpy cameras at the origin, each shifted a little more and turned about every axis."""
     batch = torch_camera(*SIZE, cameras=count)
     roll = np.array([[np.cos(0.2), -np.sin(0.2), 0, 0], [np.sin(0.2), np.cos(0.2), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     return [Camera(roll @ v.numpy(), K.numpy(), *SIZE) for v, K in zip(batch.viewmat, batch.K)]
@@ -65,7 +63,6 @@ def test_distances_and_weights_equal_numpy(device, dtype):
 
 
 def test_colors_equal_numpy(device, dtype):
-    """Points on, before and behind the surface, and beside the image; two views."""
     views = [(c, *maps(i)) for i, c in enumerate(cameras())]
     points = np.random.default_rng(5).uniform((-2, -2, -1), (2, 2, 6), (4000, 3))
     sums, weights = (torch.zeros(4000, *rest, dtype=dtype, device=device) for rest in ((3,), ()))

@@ -12,7 +12,6 @@ from tests.reference import update as reference
 from tests.reference.update import adam_reference, decayed, expected_factors
 from warpgs.kernels.update import (
     NOT_FINITE,
-    SHIFT,
     Setting,
     adam_scheduled,
     begin_step,
@@ -25,7 +24,6 @@ from warpgs.kernels.update import (
 
 
 def run(param, grads, **options):
-    """The parameter after one fused step per gradient, with its moments."""
     param, mean, square = param.clone(), torch.zeros_like(param), torch.zeros_like(param)
     for i, grad in enumerate(grads, 1):
         adam_step(param, grad, mean, square, step=i, **options)
@@ -90,13 +88,11 @@ def test_factors_are_as_frequent_as_they_should_and_follow_from_seed_and_step(de
 
 @pytest.mark.cuda
 def test_every_device_draws_the_same():
-    """A fit that moves to another device hides the same Gaussians."""
     assert torch.equal(factors("cpu", 0.3, 17), factors("cuda", 0.3, 17).cpu())
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.995, 0.999, 1 - 1e-6])
 def test_opacities_are_multiplied(device, factor):
-    """From 2e-9 to 1 - 2e-9, within a rounding of float32."""
     logits = torch.linspace(-20, 20, 1001)
     found = opacity_decay(logits.to(device), factor).cpu().numpy()
     assert np.abs(found - decayed(logits.numpy(), factor)).max() <= 1e-6
@@ -122,7 +118,6 @@ def rows(device, height=5, width=7, views=3, steps=4) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("size", [(5, 7), (1, 1), (1, 2), (33, 65)])
 def test_a_step_finds_its_own(device, size):
-    """Learning rates, settings, camera and image follow the number of the step, for images smaller than a matrix, too."""
     given, views = rows(device, *size), torch.tensor([2, 0, 1, 0], device=device)
     for step in range(4):
         counter = torch.tensor([step], device=device)
@@ -131,7 +126,6 @@ def test_a_step_finds_its_own(device, size):
 
 
 def test_nothing_is_written_beside_what_a_step_finds(device):
-    """Image sizes larger and smaller than a matrix."""
     for size in ((5, 7), (1, 1)):
         given, views = rows(device, *size), torch.tensor([2, 0, 1, 0], device=device)
         counter = torch.tensor([1], device=device)
@@ -155,14 +149,6 @@ def test_a_step_is_written_down_and_counted_if_it_counts(device, value, stopped)
         ends.append([going.tolist(), counter.tolist(), stop.tolist(), str(history.tolist())])
     assert ends[0] == ends[1]
     assert ends[0][0] == [stopped == 0 and math.isfinite(value)]
-
-
-def test_settings_stand_in_their_columns():
-    """A row holds each setting where its column says."""
-    row = Setting.row(dropout=0.2, number=7, step=4, means_lr=1e-4, shift=(0.1, 0.5, 0.9))
-    assert (row[Setting.DROPOUT], row[Setting.NUMBER], row[Setting.MEANS_LR], row[SHIFT]) == (0.2, 7, 1e-4, (0.1, 0.5, 0.9))
-    assert row[Setting.STEP] == 4
-    assert (row[Setting.RED], row[Setting.GREEN], row[Setting.BLUE]) == row[SHIFT] and len(row) == len(Setting)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 7), (37, 111)])

@@ -19,7 +19,6 @@ EXACT = RULES["exact"]
 
 
 def walked(gaussians, cam, rule, k, tile_size=16):
-    """Return median depth; ids, weights and counts of the k heaviest; and alpha, by the kernels."""
     size = {"width": cam.width, "height": cam.height, "rule": rule}
     tensors = (*gaussians.tensors().values(), cam.viewmat, cam.K)
     projected, counts = project(*tensors, **size, degree=1, tile_size=tile_size)
@@ -54,7 +53,6 @@ def test_both_equal_the_references(device, dtype, rule, tile_size, k):
 
 @pytest.mark.parametrize("rule", ["exact", "gsplat-1.5", "inria"])
 def test_median_depth_is_there_where_alpha_is_a_half(device, dtype, rule):
-    """It is above 0 where the alpha of the same render is at least 1/2, to the pixel, and 0 elsewhere."""
     gaussians, cam = cloud(400, dtype, device), camera(75, 53, cameras=2, dtype=dtype, device=device)
     found, _, alpha = walked(gaussians, cam, RULES[rule], 1)
     assert 0.1 < float((alpha < 0.5).double().mean()) < 0.9
@@ -120,7 +118,6 @@ def test_faint_gaussians_at_the_end_of_a_strip(device, dtype):
 
 
 def test_all_of_them_weigh_alpha(device, dtype):
-    """With room for all, weights sum to alpha, none comes twice, and as many are there as were blended."""
     gaussians, cam = cloud(60, dtype, device), camera(75, 53, cameras=2, dtype=dtype, device=device)
     r = rasterize(gaussians, cam, RasterizeOptions(heaviest=60))
     close("image", r.heaviest_weights.sum(-1), r.alpha)

@@ -12,7 +12,6 @@ RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
 
 
 def ball(count: int = 3000) -> Gaussians:
-    """Return small round Gaussians spread evenly over a sphere; red where x is above the centre."""
     i = np.arange(count) + 0.5
     y, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     r = np.sqrt(1 - y * y)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import camera, cloud
 from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs import rasterize
 from warpgs.app.cli import main
@@ -20,14 +19,12 @@ from warpgs.mesh.views import (
     SurfaceView,
     SurfaceViews,
     agreed,
-    densest_depths,
     depth_map,
     neighbours,
     sample_surface,
     surface_depth,
     surface_view,
     weighted_median,
-    whitening,
 )
 from warpgs.pipeline.films.paths import common_up
 from warpgs.pipeline.run import export as run_mesh
@@ -318,7 +315,6 @@ def areas_and_normals(mesh: Mesh):
 
 
 def test_a_sphere_is_closed_and_faces_outwards():
-    """Vertices a hundredth of a voxel from the surface, its area and volume, one part, every edge of two triangles."""
     mesh = fusing.extract(*grid_of(sphere))
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02 * VOXEL
     area, normals, middles = areas_and_normals(mesh)
@@ -431,27 +427,7 @@ def joined(*parts: Gaussians) -> Gaussians:
     return Gaussians(*(torch.cat(t) for t in zip(*(p.tensors().values() for p in parts))))
 
 
-def test_the_densest_point_of_a_ray():
-    gaussians, cam = cloud(40, torch.float64, "cpu"), camera(8, 6, cameras=2, dtype=torch.float64)
-    one = Camera(cam.viewmat[1].numpy(), cam.K[1].numpy(), 8, 6)
-    rays = torch.tensor([[0.1, -0.2, 1.0], [0.0, 0.3, 1.0]], dtype=torch.float64)
-    matrices, means = whitening(gaussians, one)
-    found = densest_depths(matrices, means, rays, torch.arange(40).expand(2, 40))
-    rotation, translation = (torch.as_tensor(a, dtype=torch.float64) for a in (one.viewmat[:3, :3], one.viewmat[:3, 3]))
-    quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    axes = rotation @ rotation_matrices(quats) * gaussians.log_scales.exp()[:, None]
-    covariances = axes @ axes.mT
-    centers = gaussians.means @ rotation.T + translation
-    assert torch.allclose(means, centers)
-    t = torch.linspace(1e-3, 20, 40_001, dtype=torch.float64)
-    for p, ray in enumerate(rays):
-        for i in range(40):
-            away = t[:, None] * ray - centers[i]
-            distance = (away @ torch.linalg.inv(covariances[i]) * away).sum(1)
-            best = int(distance.argmin())
-            if 0 < best < len(t) - 1:
-                assert float(found[p, i]) == pytest.approx(float(t[best]), abs=1e-3)
-    # the median by weight
+def test_the_median_by_weight():
     depths = torch.tensor([[3.0, 1.0, 2.0, 0.1], [5.0, 4.0, 9.0, 9.0], [7.0, 7.0, 7.0, 7.0]])
     weights = torch.tensor([[0.2, 0.2, 0.3, 0.0], [0.3, 0.2, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
     assert weighted_median(depths, weights).tolist() == [2.0, 5.0, 7.0]

@@ -25,12 +25,10 @@ class Scene:
     window: tuple[int, int, int, int] | None = None
 
     def inputs(self) -> Inputs:
-        """What the twins take, float32."""
         background = torch.tensor([0.3, 0.7, 0.1])
         return Inputs(*self.gaussians.tensors().values(), self.camera.viewmat, self.camera.K, background)
 
     def frame(self) -> Frame:
-        """Sizes for the twins."""
         width, height = self.camera.width, self.camera.height
         return Frame(width, height, self.gaussians.sh_degree, self.window or (0, 0, width, height))
 

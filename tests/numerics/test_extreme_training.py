@@ -41,13 +41,11 @@ few = settings(derandomize=True, deadline=None, database=None, suppress_health_c
 
 
 def gray(points) -> PointCloud:
-    """Gray points."""
     points = np.asarray(points, float).reshape(-1, 3)
     return PointCloud(points, np.full((len(points), 3), 0.5, np.float32))
 
 
 def taken(views, cloud_, device, steps: int = 3, **more) -> Trainer:
-    """A fit after some steps, all of whose numbers are finite."""
     fit = Trainer(views, cloud_, FitConfig(steps=steps, init=POINTS, sh_degree=0, **more), device)
     for _ in range(steps):
         assert math.isfinite(fit.advance()[0].loss)
@@ -235,7 +233,6 @@ def test_more_pixels_than_2_to_the_24(device):
 @few
 @given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=1, max_size=60), st.floats(0, 1))
 def test_quantiles_are_those_of_numpy(values, fraction):
-    """Linear between neighbours."""
     found = quantiles(torch.tensor(values, dtype=torch.float64), fraction)[0]
     assert math.isclose(float(found), float(np.quantile(np.array(values), fraction)), rel_tol=1e-12, abs_tol=1e-9)
 
@@ -302,20 +299,13 @@ SHORT = FitConfig(
 )  # fmt: skip
 
 
-def composed(part, name: str, value) -> FitConfig:
-    """The short fit with one field of one of its parts changed; a part's own checks run."""
-    if type(part) is FitConfig:
-        return dataclasses.replace(part, **{name: value})
-    for f in dataclasses.fields(SHORT):
-        own = getattr(SHORT, f.name)
-        if type(own) is part:
-            return dataclasses.replace(SHORT, **{f.name: dataclasses.replace(own, **{name: value})})
-    for f in dataclasses.fields(SHORT.method):
-        own = getattr(SHORT.method, f.name)
-        if type(own) is part:
-            method = dataclasses.replace(SHORT.method, **{f.name: dataclasses.replace(own, **{name: value})})
-            return dataclasses.replace(SHORT, method=method)
-    return dataclasses.replace(SHORT, **{name: value})
+def composed(part, name: str, value, config=SHORT):
+    """The short fit with one field of one of its parts changed, or None without such a part; a part's own checks run."""
+    if type(config) is part:
+        return dataclasses.replace(config, **{name: value})
+    own = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    changed = ((n, composed(part, name, value, c)) for n, c in own.items() if dataclasses.is_dataclass(c))
+    return next((dataclasses.replace(config, **{n: c}) for n, c in changed if c is not None), None)
 
 
 def test_the_list_of_settings_is_complete():

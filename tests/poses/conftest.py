@@ -28,7 +28,6 @@ def with_exif(image: np.ndarray, orientation: int, film: int = 34) -> bytes:
 
 @pytest.fixture
 def sfm():
-    """Skip where pycolmap is missing."""
     pytest.importorskip("pycolmap")
 
 
@@ -63,7 +62,6 @@ def photographs(still_life_views, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def found(photographs, tmp_path_factory):
-    """The scene found from them, and its record."""
     pytest.importorskip("pycolmap")
     from warpgs.poses.find import find_poses
 

@@ -40,8 +40,6 @@ from warpgs.poses.photographs import (
 )
 from warpgs.process import Task
 
-# From photographs to a scene with poses; whatever does not work ends in a sentence and leaves nothing behind.
-
 
 def test_all_photographs_get_the_poses_that_they_were_taken_from(found, still_life_views):
     """Up to a similarity: rotations, and the shape of the cameras' path."""
@@ -114,7 +112,6 @@ def noise(path, seed):
      ("blank", 3, "blank wall"), ("broken", 3, r"1\.png: the image cannot be decoded"), ("none", 0, "no supported image")],
 )  # fmt: skip
 def test_photographs_that_cannot_work(sfm, tmp_path, capsys, kind, count, message):
-    """One sentence, the exit code of bad data, and nothing half-written."""
     source = tmp_path / "in"
     source.mkdir()
     for i in range(count):
@@ -234,7 +231,6 @@ def test_a_reconstruction_deep_in_the_photographs_is_named(tmp_path, photographs
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no process groups")
 @pytest.mark.parametrize("everyone", [False, True], ids=["warpgs alone", "its group, as a terminal does"])
 def test_ctrl_c_ends_both_processes_and_leaves_nothing(sfm, tmp_path, photographs, everyone, heeding):
-    """One sentence, exit code 130, no process and no file left."""
     command = [*heeding, "poses", str(photographs), "--out", str(tmp_path / "deep" / "scene")]
     process = subprocess.Popen(
         [*command, "--threads", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -415,7 +411,6 @@ def unposed(names, focal=None) -> list[Photograph]:
 
 @pytest.mark.parametrize(("focal", "count", "said"), [(None, 5, True), (None, 6, False), (0.8, 5, False)])
 def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, count, said):
-    """Where EXIF does not tell it, up to five of them."""
     view = found_mapping().views[0]
     found = found_mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
     notes = record_of(found, unposed(range(count), focal), "0", [])["notes"]

@@ -76,8 +76,6 @@ def test_a_network_of_another_kind_is_refused_before_any_work(sfm, tmp_path, pho
 
 
 class Sift:
-    """A matcher whose keypoints are OpenCV's."""
-
     title = "sift.onnx (SHA-256 0)"
 
     def features(self, image, turns=0, side=0, most=0):

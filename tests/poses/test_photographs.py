@@ -28,8 +28,6 @@ from warpgs.poses.find import find_poses, source_digest
 from warpgs.poses.photographs import is_heic, prepare, to_jpeg, write_frames
 from warpgs.process import ProcessFailed
 
-# Photographs and videos of others: links lead nowhere, sizes are known before decoding, EXIF is read with bounds.
-
 BOMB = bytes.fromhex("524946461a0000005745425056503 84c0e0000002ffebfff0f071011fd0f4444ff03".replace(" ", ""))
 """A lossless WebP file of 34 bytes that unpacks to 16,383 x 16,383 px of one colour."""
 

@@ -119,5 +119,4 @@ def segmentation_weights() -> tuple[np.ndarray, np.ndarray]:
 
 
 def segmentation_network(path: Path, **options) -> str:
-    """Write a network with those logits."""
     return write(path, linear(*segmentation_weights(), **options))

@@ -10,8 +10,6 @@ from warpgs.priors.flow import pixel_grid
 from warpgs.scene import Camera, View
 from warpgs.synthetic import demo, raycast
 
-# Views whose depth is known exactly: of the demo scene, ray cast.
-
 SIZE = (160, 120)
 
 

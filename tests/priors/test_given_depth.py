@@ -26,7 +26,6 @@ def swept():
 
 
 def combined(views):
-    """Return the depths and notes of views with given maps, beside depth that was swept."""
     return with_given_depth(views, swept(), NO_POINTS)
 
 

@@ -24,12 +24,10 @@ def _print(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def sharp():
-    """Five photographs of a printed card."""
     return photos(_print, width=160, height=120, half=(1.2, 0.9), cameras=ring(9, 160, 120)[2:7])
 
 
 def _with(views, index, image):
-    """The views, one of them with another image."""
     changed = list(views)
     changed[index] = dataclasses.replace(views[index], image=np.clip(image, 0, 1).astype(np.float32))
     return changed

@@ -25,8 +25,6 @@ from warpgs.priors.sweep import (
 )
 from warpgs.scene import Camera, View
 
-# Planes in the right places, costs and paths as defined, and depth of a scene that is known exactly.
-
 CPU, PLANES = torch.device("cpu"), np.linspace(1 / 12, 1 / 2, 40)
 
 
@@ -55,7 +53,6 @@ def test_homographies_and_planes():
 
 
 def test_depths_are_the_same_bits_on_any_number_of_threads():
-    """One and three threads find the same inverse depths."""
     views, _ = still_life()
     found, before = [], torch.get_num_threads()
     for threads in (1, 3):
@@ -143,7 +140,6 @@ def test_completion_follows_the_image_and_keeps_planes():
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request):
-    """Return the device of torch."""
     return torch.device(request.param)
 
 
@@ -204,7 +200,6 @@ def test_paths_and_parabolas_are_those_of_the_definition(device):
 
 
 def test_depths_agree(device):
-    """Depths of a view of the still life are nearly all the same, with the same error."""
     views, depths = still_life()
     others = [views[0], views[2]]
     planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12))
@@ -254,7 +249,6 @@ def test_the_gpu_takes_no_more_than_it_says():
 
 @pytest.mark.cuda
 def test_a_gpu_finds_as_much_consistent_depth():
-    """Coverage of the still life agrees within half a per cent of the pixels."""
     views, _ = still_life()
     for a, b in zip(*(sweep_depths(views, [(2, 12)] * 3, d) for d in (CPU, torch.device("cuda")))):
         assert abs(a.coverage - b.coverage) < 0.005

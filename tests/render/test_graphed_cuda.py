@@ -21,8 +21,6 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
-# Calls that repeat are replayed on CUDA, with the same bits, whatever a loop does with the results.
-
 pytestmark = pytest.mark.cuda
 
 CUDA = torch.device("cuda", 0)
@@ -30,7 +28,6 @@ PLAIN = RasterizeOptions(record=False)
 
 
 def scene(count: int = 400, width: int = 70, height: int = 50) -> tuple[Gaussians, list[Camera]]:
-    """Leaves on the GPU, and cameras that turn."""
     g, cams = leaves(cloud(count, device=CUDA)), camera(width, height, 4, torch.float32, CUDA)
     return g, [Camera(v, k, width, height) for v, k in zip(cams.viewmat, cams.K)]
 
@@ -47,7 +44,6 @@ def fresh():
 
 
 def replays() -> int:
-    """Return the number of replays on the GPU, on whatever stream."""
     return sum(own.graphs.replays for own in graphed._RECORDERS.values())
 
 
@@ -79,7 +75,6 @@ def equal(a: list, b: list) -> bool:
     "options", [{}, {"rule": "gsplat-1.5", "tile_size": 8}, {"sh_degree": 0, "window": (16, 0, 32, 32), "antialiased": True}]
 )
 def test_a_loop_sees_the_same_bits(fresh, options):
-    """The results of every step agree, those of earlier steps too when all is over."""
     background = torch.tensor([0.2, 0.5, 0.1], device=CUDA)
     for more in ({}, {"background": background}):
         for keep in (True, False):
@@ -225,8 +220,6 @@ def test_hooks_and_checkpoints_run_without_graphs(fresh):
 
 
 def test_threads_render_what_they_would_alone(fresh):
-    """Four at once, each with Gaussians of its own; at most one of them has the graphs."""
-
     def work(seed):
         g = leaves(cloud(300, device=CUDA, seed=seed))
         cam, found = camera(70, 50, None, torch.float32, CUDA), {}
@@ -253,8 +246,6 @@ def test_a_device_that_is_not_the_current_one(fresh):
 
 
 def test_cameras_and_backgrounds_have_gradients(fresh):
-    """Pose, intrinsics and background, each a new tensor at every call."""
-
     def run(record):
         g, cams = scene()
         seen = []
@@ -288,7 +279,6 @@ def test_graphs_hold_no_memory(fresh):
 
 
 def test_streams_do_not_share(fresh):
-    """A loop that moves to another stream is captured there anew, and sees its own steps."""
     found = {}
     for record in (True, False):
         g, cams = scene()

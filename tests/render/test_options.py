@@ -4,7 +4,6 @@ import dataclasses
 import inspect
 import math
 import re
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -12,8 +11,9 @@ import torch
 
 import warpgs
 from tests.gaussians import LENSES, camera, cloud, lens_camera
+from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
-from tools.run_docs import ROOT, collect
+from tools.run_docs import ROOT
 from warpgs import RasterizeOptions, Rule, rasterize
 from warpgs.compat.gsplat import rasterization
 from warpgs.constants import RULES
@@ -38,7 +38,6 @@ from warpgs.scene import C0, Camera, Gaussians
     }.items(),
 )
 def test_a_rule_checks_its_cut_offs(field, values):
-    """Types and ranges; numpy's numbers are numbers, and the ends of a range are in it."""
     for value in values:
         with pytest.raises(UsageError, match=rf"Rule\.{field} must be .*{value}"):
             Rule("own", **{field: value})
@@ -92,7 +91,6 @@ BACKGROUND = torch.tensor([1.0, 0.5, 0.0])
 
 
 def cameras(device) -> list[Camera]:
-    """Two views of the cloud, the second further away."""
     both = camera(50, 34, cameras=2, dtype=torch.float32, device=device)
     return [dataclasses.replace(both, viewmat=v, K=k) for v, k in zip(both.viewmat, both.K)]
 
@@ -126,7 +124,6 @@ def test_haze_keeps_the_exact_rule(device):
 
 @pytest.mark.parametrize("error", [0.0, -1.0, float("nan"), float("inf"), "0.1"])
 def test_wrong_arguments(error):
-    """The limit, the measure and the views are checked before a view is rendered."""
     g, views = cloud(1), cameras("cpu")
     with pytest.raises(UsageError, match="positive number"):
         select_rule(g, views, max_error=error)
@@ -138,48 +135,25 @@ def test_wrong_arguments(error):
         select_rule(g, views[0], max_error=0.1)
 
 
-class Program(NamedTuple):
-    """Constants of a program, copied here as numbers so that a change of `RULES` is noticed."""
-
-    alpha_max: float
-    near: float
-    sigmas: float
-    """Half side of the square around a Gaussian that is tiled, in standard deviations; above 3.33 it never binds."""
-
-
+USUAL = {"alpha_cut": 1 / 255, "transmittance_stop": 1e-4, "inclusive_stop": False, "low_pass": 0.3}
 PROGRAMS = {
-    "gsplat-1.6": Program(0.99, 0.01, 3.33),  # include/Common.h: MAX_ALPHA, GAUSSIAN_EXTEND; rendering.py: near_plane
-    "gsplat-1.5": Program(0.999, 0.01, 3.33),  # csrc/RasterizeToPixels3DGSFwd.cu, csrc/ProjectionEWA3DGSFused.cu
-    "inria": Program(0.99, 0.2, 3.0),  # forward.cu, auxiliary.h of diff-gaussian-rasterization
+    # include/Common.h: MAX_ALPHA, GAUSSIAN_EXTEND, of 3.33 sigma, which never binds; rendering.py: near_plane
+    "gsplat-1.6": Rule("own", alpha_max=0.99, near=0.01, **USUAL),
+    # csrc/RasterizeToPixels3DGSFwd.cu, csrc/ProjectionEWA3DGSFused.cu
+    "gsplat-1.5": Rule("own", alpha_max=0.999, near=0.01, **USUAL),
+    # forward.cu, auxiliary.h of diff-gaussian-rasterization
+    "inria": Rule("own", alpha_max=0.99, near=0.2, square_sigma=3.0, **USUAL),
 }
+"""Constants of programs, copied here as numbers so that a change of `RULES` is noticed."""
 
 
-def image_of(gaussians: Gaussians, cam, program: Program) -> torch.Tensor:
-    """Return the image [H, W, 3] over black: 1/255 cuts, a Gaussian that leaves less than 1e-4 ends the pixel unblended."""
+def image_of(gaussians: Gaussians, cam, program: Rule) -> torch.Tensor:
+    """Return the image [H, W, 3] over black."""
     tensors = [t.double() for t in gaussians.tensors().values()]
     size = {"width": cam.width, "height": cam.height}
-    means, covs, colors, depths, opacities = project_reference(
-        *tensors, cam.viewmat[None], cam.K[None], **size, degree=1, low_pass=0.3
-    )
-    xs, ys = (torch.arange(count, dtype=torch.float64) + 0.5 for count in (cam.width, cam.height))
-    image = torch.zeros(cam.height, cam.width, 3, dtype=torch.float64)
-    left = torch.ones(cam.height, cam.width, dtype=torch.float64)
-    done = torch.zeros_like(left, dtype=torch.bool)
-    for n in torch.argsort(depths[0], stable=True).tolist():
-        if depths[0, n] < program.near:
-            continue
-        A, dx, dy = torch.linalg.inv(covs[0, n]), xs - means[0, n, 0], (ys - means[0, n, 1])[:, None]
-        alpha = opacities[n] * torch.exp(-0.5 * (A[0, 0] * dx**2 + 2 * A[0, 1] * dx * dy + A[1, 1] * dy**2))
-        radius = torch.ceil(program.sigmas * torch.linalg.eigvalsh(covs[0, n])[-1].sqrt())
-        columns, rows = ((d.abs() <= radius).view(-1) for d in (dx, dy))
-        tiled = [torch.stack([part.any().expand(len(part)) for part in inside.split(16)]) for inside in (columns, rows)]
-        hit = (alpha >= 1 / 255) & tiled[0].view(-1) & tiled[1].view(-1, 1) & ~done
-        after = left * (1 - alpha.clamp_max(program.alpha_max))
-        done |= hit & (after < 1e-4)
-        hit &= ~done
-        image += torch.where(hit, left - after, 0.0)[..., None] * colors[0, n]
-        left = torch.where(hit, after, left)
-    return image
+    projected = project_reference(*tensors, cam.viewmat[None], cam.K[None], **size, degree=1, low_pass=program.low_pass)
+    means, covs, colors, depths, opacities = (t[0] if t.ndim > 1 else t for t in projected)
+    return blend_reference(means, covs, opacities, colors, depths, torch.zeros(3).double(), *size.values(), program)[0]
 
 
 def crowd() -> Gaussians:
@@ -187,7 +161,7 @@ def crowd() -> Gaussians:
     g = cloud(250, torch.float64, seed=5)
     depths = torch.linspace(0.05, 6, len(g), dtype=torch.float64)
     means = g.means * depths[:, None] / g.means[:, 2:]
-    return Gaussians(means, g.quats, g.log_scales + (depths / 4).log()[:, None], 3 * g.logit_opacities + 3, g.sh)
+    return Gaussians(means, g.quats, g.log_scales + 0.5 + (depths / 4).log()[:, None], 3 * g.logit_opacities + 3, g.sh)
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
@@ -203,7 +177,6 @@ def test_a_rule_has_the_constants_of_its_program(name, device):
 
 
 def test_a_program_is_named_with_its_version():
-    """The name without one is refused with the names that there are."""
     with pytest.raises(UsageError, match=r"'gsplat' needs a version.*choose gsplat-1\.6 or gsplat-1\.5$"):
         rasterize(cloud(1), camera(), RasterizeOptions(rule="gsplat"))
     assert {n for n in RULES if n.startswith("gsplat")} == {n for n in PROGRAMS if n.startswith("gsplat")}
@@ -253,7 +226,6 @@ def bound_scene(number: int) -> tuple[str, Gaussians, Camera, torch.Tensor]:
 
 
 def error_and_bound(number: int, device, rule) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the true error of a scene's render and its bound, float64, shape [H, W] each."""
     _, g, cam, background = bound_scene(number)
     truth = reference_image(g, cam, (0, 0, WIDTH, HEIGHT), background, 1)
     on_device = Gaussians(**{n: t.to(device) for n, t in g.tensors().items()})
@@ -273,12 +245,6 @@ def bounds(number: int, device) -> None:
 def test_the_bound_holds_and_is_tight(device):
     """Two scenes of each kind, under every rule and one that differs in everything."""
     for number in range(2 * len(KINDS)):
-        bounds(number, device)
-
-
-@pytest.mark.slow
-def test_the_bound_holds_in_more_scenes(device):
-    for number in range(2 * len(KINDS), 10 * len(KINDS)):
         bounds(number, device)
 
 
@@ -324,22 +290,11 @@ def off_and_bound(g, cam, options, error):
 
 
 def composited(projected, background, rule, width, height) -> torch.Tensor:
-    """Return the image [H, W, 3] of projected Gaussians [N, 12] with the cut-offs of a rule, pixel by pixel, layer by layer."""
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    image, left, open_ = (
-        torch.zeros(height, width, 3).double(),
-        torch.ones(height, width).double(),
-        torch.ones(height, width) > 0,
-    )
-    for row in projected[projected[:, 9].argsort(stable=True)]:
-        dx, dy = x - row[0], y - row[1]
-        square = (row[2] * dx + row[3] * dy) ** 2 + (row[4] * dy) ** 2
-        alpha = (row[5] * torch.exp(-square / 2)).clamp_max(rule.alpha_max)
-        alpha = torch.where(open_ & (alpha >= rule.alpha_cut), alpha, 0.0)
-        image += (alpha * left)[..., None] * row[6:9]
-        left = left * (1 - alpha)
-        open_ &= left >= rule.transmittance_stop
-    return image + left[..., None] * background
+    """Return the image [H, W, 3] of projected Gaussians [N, 12] with the cut-offs of a rule."""
+    seen = projected[projected[:, 5] > 0]
+    factors = torch.stack([seen[:, 2], seen[:, 3], torch.zeros_like(seen[:, 2]), seen[:, 4]], -1).view(-1, 2, 2)
+    covs = torch.linalg.inv(factors.mT @ factors)
+    return blend_reference(seen[:, :2], covs, seen[:, 5], seen[:, 6:9], seen[:, 9], background, width, height, rule)[0]
 
 
 @pytest.mark.parametrize("rule", IMAGE_RULES)
@@ -391,7 +346,6 @@ def test_the_error_is_used_up(device, dtype):
 
 
 def test_an_error_is_for_images_alone(device):
-    """Wrong numbers, options and rules; gradients by anything that has one."""
     for value in (0, -1.0, math.nan, math.inf, True, "0.1"):
         with pytest.raises(UsageError, match="max_error must be a positive number"):
             RasterizeOptions(max_error=value)
@@ -437,7 +391,6 @@ def test_large_images_within_an_error():
             del graphed
 
 
-PAGE = ROOT / "docs" / "coming-from-gsplat.md"
 ARGUMENTS = """means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree
 packed tile_size backgrounds render_mode sparse_grad absgrad rasterize_mode channel_chunk distributed camera_model segmented
 covars
@@ -447,14 +400,7 @@ renderer_config""".split()
 """Arguments of gsplat 1.6.0's rasterization, in its order."""
 
 
-def test_the_page_on_gsplat_runs_and_has_every_argument(capsys):
-    """The block with warpgs prints the shapes that its comment states; the page stays short."""
-    (block,) = [b for b in collect(PAGE.name, PAGE.read_text("utf-8")) if b.python and b.code]
-    exec(compile(block.code, PAGE.name, "exec"), {})
-    printed = re.findall(r"\[[\d, ]+\]", capsys.readouterr().out)
-    assert printed == re.findall(r"\[[\d, ]+\]", block.code.splitlines()[-1].split("#")[1])
-    text = PAGE.read_text("utf-8")
-    table = text.split("## Arguments")[1].split("## Results")[0]
+def test_the_page_on_gsplat_has_every_argument():
+    table = (ROOT / "docs/coming-from-gsplat.md").read_text("utf-8").split("## Arguments")[1].split("## Results")[0]
     named = [name for row in table.splitlines()[4:] for name in re.findall(r"`(\w+)`", row.split("|")[1] if "|" in row else "")]
     assert set(named) == set(ARGUMENTS) and list(inspect.signature(rasterization).parameters) == ARGUMENTS
-    assert len(text.split()) <= 900

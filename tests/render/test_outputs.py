@@ -55,25 +55,14 @@ def test_a_gradient_reaches_the_gaussians_or_is_refused(device, name, most):
     assert not plain.requires_grad and torch.equal(plain, values)
 
 
-def test_outputs_of_the_pixels_refuse_too(device):
-    """A list of pixels in place of an image."""
-    gaussians, cam = leaves(cloud(60, device=device)), camera(40, 24, dtype=torch.float32, device=device)
-    pixels = torch.tensor([[3, 5], [30, 20]], device=device)
-    render = rasterize(gaussians, cam, RasterizeOptions(pixels=pixels, median_depth=True))
-    with pytest.raises(UsageError, match="median_depth has no gradient"):
-        render.median_depth.sum().backward()
-
-
 SIZE = (75, 53)  # no multiple of a tile
 
 
 def random(*shape, seed=0, dtype=torch.float32, device="cpu"):
-    """Numbers of either sign, well beyond [0, 1]."""
     return (3 * torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)).to(device, dtype)
 
 
 def scene(dtype, device, channels):
-    """A cloud, two cameras, channels of each Gaussian and their backgrounds."""
     how = {"dtype": dtype, "device": device}
     values, behind = random(400, channels, **how), random(2, channels, seed=1, **how)
     return cloud(400, dtype, device), camera(*SIZE, cameras=2, **how), values, behind
@@ -101,7 +90,6 @@ def test_features_beside_colors_change_nothing_of_them(device):
 
 
 def test_wrong_channels_are_named():
-    """Type, scalar type, number of Gaussians and of cameras, no channel, backgrounds of another length."""
     gaussians, cam, values, behind = scene(torch.float32, "cpu", 8)
     for kind, words, options in [
         (TypeError, "features must be a torch tensor, not ndarray", {"features": np.zeros((400, 8))}),
@@ -135,7 +123,6 @@ def test_leaves_render_where_autograd_is_off(what, device):
 
 
 def scalar(render):
-    """A loss that reads all three images."""
     return render.rgb.square().sum() + render.alpha.square().sum() + 0.1 * render.depth.square().sum()
 
 
@@ -182,13 +169,11 @@ def test_absgrad_does_not_depend_on_how_it_is_rendered(device, options):
 
 
 def test_a_render_prints_shapes():
-    """Not its tensors."""
     text = repr(rasterize(cloud(5), camera(40, 24, dtype=torch.float32)))
     assert text.startswith("Render(rgb=[24, 40, 3], alpha=[24, 40]") and len(text) < 200
 
 
 def native_call(device, **options):
-    """Gradients by `rasterize`, whose results are all read."""
     render = rasterize(
         leaves(cloud(50, device=device)), camera(40, 24, dtype=torch.float32, device=device), RasterizeOptions(**options)
     )
@@ -196,7 +181,6 @@ def native_call(device, **options):
 
 
 def gsplat_call(device, **arguments):
-    """Gradients by `compat.gsplat.rasterization`, whose dictionary is read."""
     given, cam = leaves(cloud(50, device=device)), camera(40, 24, dtype=torch.float32, device=device)
     tensors = given.means, given.quats, given.log_scales.exp(), given.logit_opacities.sigmoid(), given.sh
     poses = (torch.as_tensor(t, device=device)[None] for t in (cam.viewmat, cam.K))
@@ -303,7 +287,6 @@ def test_means_can_be_copied_and_pickled(absgrad):
 
 
 def transforms_scene():
-    """A small cloud, and a loss as a function of its means."""
     gaussians, cam = leaves(cloud(30)), camera(dtype=torch.float32)
 
     def loss(means, options=None, linear=False):
@@ -393,18 +376,15 @@ COMBINATIONS_SIZE = (50, 37)
 
 
 def tensors_of(gaussians) -> list[torch.Tensor]:
-    """Return what Gaussians of a kind are made from."""
     return [getattr(gaussians, f.name) for f in dataclasses.fields(gaussians)]
 
 
 def seen_by(model: str, width: int, height: int, **options) -> Camera:
-    """Return a camera of a model."""
     size = {"width": width, "height": height}
     return camera(**size, **options) if model == "pinhole" else lens_camera(model, **size, **options)
 
 
 def some(*shape, like: torch.Tensor, seed: int = 0) -> torch.Tensor:
-    """Return random numbers of either sign."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(like)
 
 
@@ -417,7 +397,6 @@ CASES = [
 
 @pytest.mark.parametrize(("model", "kind", "antialiased"), CASES)
 def test_gradcheck(device, model, kind, antialiased):
-    """Finite differences of every differentiable output, by every tensor that may require gradients."""
     given, cam = of_kind(kind, hand_placed(device=device, degree=1)), seen_by(model, 12, 11, device=device)
     own = tensors_of(given)
     others = [cam.viewmat, cam.K, some(3, like=cam.K), some(6, 2, like=cam.K, seed=1), some(2, like=cam.K, seed=2)]

@@ -57,7 +57,6 @@ def test_native_kernels_agree_with_generic_ones(size):
 
 
 def test_one_camera_has_no_leading_axis_and_errors_name_the_cause(device):
-    """A single camera gives images without a batch axis, equal to a batch of one; numpy cameras work too."""
     gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
     single = rasterize(gaussians, cam)
     batch = rasterize(gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[None], K=cam.K[None]))
@@ -79,16 +78,20 @@ def test_arguments_of_another_type_or_shape_are_named():
     fisheye = dataclasses.replace(cam, model="fisheye", distortion=torch.tensor(0.0))
     others, uncoloured = (torch.ones(1, 4), torch.ones(1, 3), torch.ones(1)), RasterizeOptions(colors=torch.ones(1, 3))
 
-    def seen(**change):
-        return gaussians, dataclasses.replace(cam, **change)
+    def seen(camera=cam, **change):
+        return gaussians, dataclasses.replace(camera, **change)
 
     def scene(**change):
         return dataclasses.replace(gaussians, **change), cam
+
+    def of(dtype):
+        return {n: t.to(dtype) for n, t in gaussians.tensors().items()}
 
     def asked(**options):
         return gaussians, cam, RasterizeOptions(**options)
 
     sparse = {"viewmat": torch.eye(4).to_sparse(), "K": torch.eye(3).to_sparse(), "distortion": torch.zeros(4).to_sparse()}
+    two = dataclasses.replace(camera(8, 8, cameras=2, dtype=torch.float32), model="fisheye", distortion=torch.zeros(4))
     no_number = cam.K * torch.tensor([[torch.nan, 1, 1], [1, 1, 1], [1, 1, 1]])
     wrong = [
         (TypeError, "gaussians must be an instance of Gaussians, .* or CovarianceGaussians, not Camera", (cam, gaussians)),
@@ -108,6 +111,9 @@ def test_arguments_of_another_type_or_shape_are_named():
         (UsageError, "unknown camera model None", seen(model=None)),
         *((TypeError, f"camera.{n} must be dense, not torch.sparse_coo", seen(**{n: t})) for n, t in sparse.items()),
         (ValueError, r"camera.distortion must have shape \[P\] or \[C, P\], not \[\]", (gaussians, fisheye)),
+        (ValueError, r"camera\.K must .* \[2, 3, 3\].*, not \[3, 3, 3\]", seen(two, K=torch.eye(3).repeat(3, 1, 1))),
+        (ValueError, r"camera\.K must .* \[1, 3, 3\].*viewmat.*, not \[2, 3, 3\]", seen(two, viewmat=torch.eye(4))),
+        (ValueError, r"camera\.distortion must .* \[2, 4\].*, not \[3, 4\]", seen(two, distortion=torch.zeros(3, 4))),
         (TypeError, "background must be dense", asked(background=torch.ones(3).to_sparse())),
         (TypeError, "background must be numbers", asked(background=1j * torch.ones(3))),
         (TypeError, "pixels must be dense", asked(pixels=torch.tensor([[1, 2]]).to_sparse())),
@@ -118,18 +124,10 @@ def test_arguments_of_another_type_or_shape_are_named():
         (TypeError, "quats must be dense, not torch.sparse", scene(quats=gaussians.quats.to_sparse())),
         (ValueError, "camera.K has non-finite values", seen(K=no_number)),
         (ValueError, r"background must have shape \[3\] or \[C, 3\], C=1, not \[2, 3\]", asked(background=torch.zeros(2, 3))),
-        (
-            ValueError,
-            r"colors \[3, 4, 3\] .* give spherical harmonics as sh of the Gaussians",
-            asked(colors=torch.zeros(3, 4, 3)),
-        ),
+        (ValueError, r"colors \[3, 4, 3\] .* give spherical harmonics as sh of", asked(colors=torch.zeros(3, 4, 3))),
         *(
-            (
-                TypeError,
-                f"means must be float32 or float64, not {dtype}; means.float",
-                scene(**{n: t.to(dtype) for n, t in gaussians.tensors().items()}),
-            )
-            for dtype in (torch.float16, torch.bfloat16, torch.int64)
+            (TypeError, f"means must be float32 or float64, not {t}; means.float", scene(**of(t)))
+            for t in (torch.half, torch.int64)
         ),
         (UsageError, "give opacity_factors.detach", (gaussians, cam, learned)),
         (ResourceError, r"need 28,000,000,000,000 bytes, and [\d,]+ are free on cpu", (gaussians, large)),
@@ -143,7 +141,6 @@ def test_arguments_of_another_type_or_shape_are_named():
 
 
 def test_opacity_factors_multiply_opacities_and_hide():
-    """Image and gradients are those of such opacities, also in chunks; 0 hides a Gaussian and leaves it no gradient."""
     gaussians, camera = three_gaussians(), ring(3)[0]
     factors = torch.tensor([0.5, 0.0, 1.0])
     opacities = gaussians.logit_opacities.sigmoid() * factors
@@ -191,13 +188,11 @@ ANTIALIASED = RasterizeOptions(antialiased=True)
 
 
 def small(dtype=torch.float64, device="cpu"):
-    """Six Gaussians with axes from 0.2 to 1 px, as leaves."""
     g = hand_placed(dtype, device)
     return leaves(Gaussians(**{**g.tensors(), "log_scales": g.log_scales - 2}))
 
 
 def reference(tensors, cam, rule):
-    """Opacities [C, N] with the factor from determinants of matrices, and the images of each camera."""
     means, covs, colors, depths, opacities = project_reference(
         *tensors, width=cam.width, height=cam.height, degree=3, low_pass=rule.low_pass
     )
@@ -210,7 +205,6 @@ def reference(tensors, cam, rule):
 
 @pytest.mark.parametrize("rule", [SMOOTH, RULES["exact"]], ids=lambda rule: rule.name)
 def test_opacities_images_and_gradients_equal_reference(device, dtype, rule):
-    """By matrices and autograd in float64: Gaussians, poses and intrinsics."""
     gaussians, cam = small(dtype, device), camera(cameras=2, dtype=dtype, device=device)
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
     r = rasterize(gaussians, dataclasses.replace(cam, viewmat=views, K=Ks), dataclasses.replace(ANTIALIASED, rule=rule))
@@ -288,7 +282,6 @@ def test_float32_keeps_the_digits_of_needles(device):
 
 @pytest.mark.parametrize("low_pass", [0.3, 0.0])
 def test_extremes_are_finite(device, dtype, low_pass):
-    """Points, lines, discs seen from the edge, needles up to 1e20 px: finite images and gradients; no area, no brightness."""
     sizes = (0.0, 1e-30, 1e-12, 1e-3, 1.0, 1e3, 1e9, 1e20)
     g, cam = spots([(a, b, c) for a in sizes for b in sizes for c in (0.0, 1.0, 1e9)], dtype, device)
     for rule in (SMOOTH, RULES["exact"]):
@@ -321,7 +314,6 @@ def cast(options: dict, dtype, device) -> dict:
 
 @pytest.mark.parametrize("path", PATHS)
 def test_gaussians_outside_are_not_there(path, device, dtype):
-    """To the bit, the images and gradients are those without them, whose gradients are zero."""
     cam, planes = camera(64, 48, dtype=dtype, device=device), {} if path == "rule" else PLANES
     g = cloud(200, dtype, device)
     inside = (g.means[:, 2] >= PLANES["near"]) & (g.means[:, 2] <= PLANES["far"])
@@ -346,7 +338,6 @@ def test_gaussians_outside_are_not_there(path, device, dtype):
 
 @pytest.mark.parametrize("model", LENSES)
 def test_the_depth_of_a_lens(model, dtype, device):
-    """Along the z axis, or the distance from a fisheye."""
     g, cam = cloud(200, dtype, device), lens_camera(model, width=64, height=48, dtype=dtype, device=device)
     depths = g.means.norm(dim=1) if model == "fisheye" else g.means[:, 2]
     inside = (depths >= PLANES["near"]) & (depths <= PLANES["far"])
@@ -356,7 +347,6 @@ def test_the_depth_of_a_lens(model, dtype, device):
 
 
 def test_planes_are_inclusive(device, dtype):
-    """A mean on a plane is rendered, one float beyond is not."""
     g, cam = cloud(6, dtype, device), camera(dtype=dtype, device=device)
     near, far = (torch.tensor(p, dtype=dtype) for p in PLANES.values())
     inf = torch.tensor(math.inf, dtype=dtype)

@@ -8,7 +8,6 @@ import torch
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
-from warpgs.kernels import tiles
 from warpgs.render.chunked import chunks
 from warpgs.render.compose import inputs_of, pass_of
 from warpgs.render.options import RasterizeOptions
@@ -18,7 +17,6 @@ SIZE = (75, 53)  # no multiple of a tile
 
 
 def scene(dtype, device):
-    """Two cameras that see a cloud, and background colours."""
     background = torch.tensor([[0.1, 0.5, 0.9], [0.7, 0.2, 0.3]], dtype=dtype, device=device)
     return cloud(400, dtype, device), camera(*SIZE, cameras=2, dtype=dtype, device=device), background
 
@@ -46,7 +44,6 @@ def test_chunks_keep_to_their_number_and_notice_changed_sources():
     "window", [(1, 0, 16, 16), (0, 8, 75, 8), (0, 0, 20, 53), (0, 0, 0, 16), (0, 16, 75, 40), (-16, 0, 32, 16)]
 )
 def test_windows_off_the_tiles_are_refused(window):
-    """An edge inside a tile or beyond the image, or an empty window."""
     gaussians, cam, _ = scene(torch.float32, "cpu")
     with pytest.raises(UsageError, match=r"window .* multiples of 16"):
         rasterize(gaussians, cam, RasterizeOptions(window=window))
@@ -56,7 +53,6 @@ MAPS = ("rgb", "alpha", "depth", "median_depth", "features", "heaviest_ids", "he
 
 
 def pixels_scene(device, dtype=torch.float32, cameras=2):
-    """Gaussians and a batch of cameras, with everything that one can render of them."""
     gaussians, cam = cloud(300, dtype, device), camera(*SIZE, cameras=cameras, dtype=dtype, device=device)
     features = torch.randn(300, 5, dtype=dtype, generator=torch.Generator().manual_seed(1)).to(device)
     options = RasterizeOptions(
@@ -95,7 +91,6 @@ def test_they_have_the_bits_of_the_image(device, dtype, low, high, how):
 
 @pytest.mark.parametrize("how", [{}, {"max_instances": 100}, {"colors": True}], ids=["", "chunked", "channels"])
 def test_gradients_are_those_of_the_image(device, how):
-    """To the bit, of Gaussians, pose, K, background and channels, also where a pixel comes twice."""
     gaussians, cam, options = pixels_scene(device)
     options = dataclasses.replace(options, heaviest=0, **{k: v for k, v in how.items() if k != "colors"})
     if "colors" in how:
@@ -120,25 +115,7 @@ def test_gradients_are_those_of_the_image(device, how):
         assert torch.allclose(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
 
 
-def test_tiles_without_a_pixel_are_empty(device, monkeypatch):
-    """Of the tiles around two far pixels, those two alone have Gaussians."""
-    gaussians, cam, _ = pixels_scene(device, cameras=1)
-    made = []
-
-    def bin_tiles(*arguments, **named):
-        made.append(tiles.bin_tiles(*arguments, **named))
-        return made[-1]
-
-    monkeypatch.setattr("warpgs.render.rasterize.bin_tiles", bin_tiles)
-    pixels = torch.tensor([[20, 20], [60, 20]], device=device)
-    r = rasterize(gaussians, cam, RasterizeOptions(pixels=pixels))
-    lengths = made[0].ranges.diff(dim=1).flatten().tolist()
-    assert len(lengths) == 3 and lengths[1] == 0 and lengths[0] > 0 and lengths[2] > 0
-    assert int(r.tile_counts.sum()) > sum(lengths), "the window is what is projected"
-
-
 def test_no_pixel_at_all(device):
-    """Images of no pixel, and gradients of zero."""
     gaussians, cam, options = pixels_scene(device)
     gaussians.means.requires_grad_()
     r = rasterize(gaussians, cam, dataclasses.replace(options, pixels=torch.zeros(0, 2, dtype=torch.int64)))
@@ -157,15 +134,6 @@ def test_no_pixel_at_all(device):
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(pixels, kind, match):
-    """Other types and shapes, pixels outside, and options that do not go with a list."""
     gaussians, cam, _ = pixels_scene(torch.device("cpu"))
     with pytest.raises(kind, match=match):
         rasterize(gaussians, cam, RasterizeOptions(pixels=pixels))
-
-
-def test_coefficients_that_require_gradients_are_refused():
-    """An error instead of a gradient that is missing."""
-    gaussians, cam, _ = pixels_scene(torch.device("cpu"))
-    lens = dataclasses.replace(cam, model="fisheye", distortion=torch.zeros(4, requires_grad=True))
-    with pytest.raises(UsageError, match="detach"):
-        rasterize(gaussians, lens)

@@ -40,7 +40,6 @@ film.release()
 @pytest.mark.skipif(sys.platform == "win32", reason="scripts have no #! line")
 @pytest.mark.parametrize(("code", "more", "used"), [(0, "pass", True), (1, "pass", False), (0, "sys.exit()", True)])
 def test_ffmpeg_encodes_if_it_can(tmp_path, monkeypatch, code, more, used):
-    """It gets all frames in order; one that has no encoder is not used; one that ends early leaves the old film."""
     monkeypatch.setattr(film_files, "h264_encoder", encoder)
     program, path = tmp_path / "bin" / "ffmpeg", tmp_path / "out" / "a.mp4"
     for folder in (program.parent, path.parent):

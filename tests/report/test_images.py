@@ -25,8 +25,6 @@ from warpgs.report.images import (
     webp,
 )
 
-# Sheets of labelled images: every tile in its place, unharmed, with its label, range and text.
-
 TOP = CONTACT_MARGIN + TITLE_SIZE + 18
 
 

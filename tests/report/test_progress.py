@@ -9,8 +9,6 @@ from warpgs.report.progress import Progress, Stages, duration, waiting
 
 
 class Terminal(io.StringIO):
-    """Stdout that is a terminal."""
-
     encoding = "utf-8"
 
     def isatty(self) -> bool:
@@ -82,7 +80,6 @@ def test_time_left_is_that_of_the_steps_to_come(clock):
 
 
 def shown_left(line: str) -> float:
-    """Return the time left on a line of progress [s]."""
     words = line.rpartition("left ")[2].partition(",")[0].split()
     return sum(float(n) * {"s": 1, "min": 60, "h": 3600}[unit] for n, unit in zip(words[::2], words[1::2]))
 
@@ -105,19 +102,6 @@ def test_time_left_counts_the_growth_to_come_and_does_not_rise(clock, speed):
     for step, seconds in left[:-1]:
         assert abs(seconds / sum(took[step:]) - 1) < 0.25 or abs(seconds - sum(took[step:])) < 5
     assert len(left) > 7 and left[-1] == (600, 0)
-
-
-def test_a_step_takes_no_sum_over_those_left(clock):
-    """They are tens of thousands in fits of many views."""
-
-    class Times(list):
-        def __getitem__(self, _):
-            pytest.fail("asked again")
-
-    with Progress(3, planned=Times([1.0, 2.0, 4.0]), live=False) as progress:
-        for step in (1, 2):
-            progress.update(step=step, loss=0.1, psnr=30.0, count=5, seconds=6.0)
-        assert progress.left == 12
 
 
 def test_durations_and_stages_of_the_set_up(clock):

@@ -140,7 +140,6 @@ def test_this_machine_and_memory_that_torch_holds_unused(monkeypatch):
 
 
 def test_without_control_groups(elsewhere):
-    """What psutil says; a limit above the machine, or a file of nonsense, changes nothing."""
     assert device.container_memory() is None and device.machine_memory() == (16 * GIB, 10 * GIB)
     assert (device.installed_bytes(CPU), device.available_bytes(CPU)) == (16 * GIB, 10 * GIB)
     group(elsewhere, "", memory__max=64 * GIB, memory__current=0)

@@ -22,8 +22,6 @@ from warpgs.pipeline.run.folder import load_checkpoint
 from warpgs.report.progress import EventLog
 from warpgs.synthetic.demo import split_spec, write_demo
 
-# Output that cannot be written: said once, and no result is another for it.
-
 with_sh = pytest.mark.skipif(sys.platform == "win32", reason="the shell of these tests is sh")
 GOES_ON = "; the command continues without it\n"
 LOST = {

@@ -12,8 +12,6 @@ from warpgs.io.load import load_scene
 from warpgs.scene import Camera
 from warpgs.synthetic import demo, raycast
 
-# The demo folder, read back by a parser of its own and checked against its own images.
-
 SIZE = {"views": 9, "width": 128, "height": 96}
 
 

@@ -340,7 +340,6 @@ def site(page=""):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene and a run on it."""
     import warpgs
 
     folder = tmp_path_factory.mktemp("browser")

@@ -66,7 +66,6 @@ def opened(server) -> socket.socket:
 
 
 def framed(data: bytes, kind=2) -> bytes:
-    """A frame of a websocket, as browsers send it: with a mask, here of zeros."""
     return bytes([0x80 | kind]) + struct.pack("!BQ", 0xFF, len(data)) + bytes(4) + data
 
 
@@ -150,7 +149,6 @@ def test_a_wrong_message_closes_its_connection_alone(server, data, capfd):
 
 
 def test_text_and_garbage_close_the_connection(server, capfd):
-    """A text message, frames that are none, and a request that is none."""
     with opened(server) as stream:
         stream.sendall(framed(b"text", kind=1))
         assert closes(stream)
