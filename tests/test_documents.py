@@ -95,7 +95,6 @@ BY_HAND = {
     ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
     ("dependencies.md", "| needed for"): "versions in names of licences",
     ("evaluation.md", "| key | definition"): "definitions",
-    ("numerics.md", "| change | time"): "a summary of two files of results, with charts of both",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
     ("results.md", "| cited | networks"): "published scores, each with its source",
     ("tiles.md", "| bound | margin"): "derived margins",

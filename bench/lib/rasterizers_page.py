@@ -22,9 +22,9 @@ def times_table(result: dict) -> str:
     """Return GPU and wall time by direction, and peak memory, of each program with three channels."""
     body = []
     for row in _colours(result):
-        for who, peak in row["peak_mib"].items():
+        for place, (who, peak) in enumerate(row["peak_mib"].items()):
             times = [figure(row[kind][d][who]["median"]) for kind in ("gpu_ms", "wall_ms") for d in DIRECTIONS]
-            body.append([_size(row), who, *times, figure(peak)])
+            body.append(["" if place else _size(row), who, *times, figure(peak)])
     times = [f"{kind}: {d} [ms]" for kind in ("GPU", "wall") for d in DIRECTIONS]
     return markdown(["Gaussians, image", "program", *times, "MiB"], body, LEFT)
 

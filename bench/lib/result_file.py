@@ -110,17 +110,17 @@ def machine_name(values: dict) -> str:
 
 
 def source(name: str) -> str:
-    """Return a line on a kept result for the pages: file, machine, commit, command without its output, if it has a note."""
+    """Return a line on a kept result for the pages: file, machine, commit, command without its output, cut if it is long."""
     values = read(FOLDER / f"{name}.json")
     machine = machine_name(values)
     if values["machine"]["device"] == "cpu":
         machine += ", " + values["machine"]["name"].replace("(R)", "").removesuffix(" Processor")
     command = re.sub(r" --out [\w./]+", "", values["command"] or "")
+    command = re.sub(r"^(python -m \S+)( \S+){7,}$", r"\1 ...", command)
     fence = "``" if "`" in command else "`"
     ran = f"{fence}{command}{fence}" if command else "command not kept"
     commit = values.get("commits", {}).get("new") or values["commit"] or "not kept"
-    note = " More: its `note`." if values.get("note") else ""
-    return f"Source: `{name}.json`; {machine}; commit {commit}; {ran}.{note}\n"
+    return f"Source: `{name}.json`; {machine}; commit {commit}; {ran}.\n"
 
 
 def stored(kind: str) -> dict[str, dict]:

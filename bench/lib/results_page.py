@@ -127,5 +127,5 @@ def scores() -> str:
         body.append([words, len(d.values), *means, f"{mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"])
     head = ["scene", "fits", "sampled uniformly", "sampled by all three scores", "difference"]
     files = ", ".join(f"`{file}.json`" for file in dict.fromkeys(file for file, _ in SCORED.values()))
-    note = "held-out PSNR [dB]; objects: over white, and measured before `default` smoothed depth with 8 views"
+    note = "held-out PSNR [dB]; objects: over white"
     return markdown(head, body, head[:1]) + f"\nSources: {files}; {note}.\n"

@@ -40,9 +40,9 @@ def packing() -> str:
         result, source = _result(file)
         sources += source
         for r in result["rows"]:
-            cells = [f"{r['gpus']}", f"{r['per_gpu']}", f"{r['fits_per_hour']:,.0f}", f"{r['mean_seconds_of_a_fit']:.1f} s"]
-            body.append([jobs, *cells, f"{r['seconds']:.0f} s"])
-    return table(["jobs", "GPUs", "`--per-gpu`", "fits per hour", "time per fit", "wall time"], body) + sources
+            cells = [f"{r['gpus']}", f"{r['per_gpu']}", f"{r['fits_per_hour']:,.0f}", f"{r['mean_seconds_of_a_fit']:.1f}"]
+            body.append([jobs if r is result["rows"][0] else "", *cells, f"{r['seconds']:.0f}"])
+    return table(["jobs", "GPUs", "`--per-gpu`", "fits per hour", "one fit [s]", "all [s]"], body) + sources
 
 
 def ranks() -> str:
