@@ -9,8 +9,9 @@ from collections.abc import Iterable, Sequence
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]], left: Sequence[str] | None = None) -> str:
     """Return a Markdown table."""
-    rule = ["---" if left is None or name in left else "---:" for name in head]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, rule, *rows)) + "\n"
+    rule = "|".join("---" if left is None or name in left else "---:" for name in head)
+    first, *rest = ("| " + " | ".join(map(str, line)) + " |" for line in (head, *rows))
+    return "\n".join([first, f"|{rule}|", *rest]) + "\n"
 
 
 def figure(value: float) -> str:

@@ -461,7 +461,7 @@ def test_the_time_of_a_cpu_limits_steps_and_images():
     events = plan_phases(made.phases, 600).events
     times, counts = step_times(made, 40, 360_000, 100_000)
     assert counts[0] == counts[events[0] - 2] == 100_000 and counts[-1] == 300_000 and bool((np.diff(counts) >= 0).all())
-    assert times[-1] > 2 * times[events[0] - 2] > 2.2 * times[0] and all(times[e - 1] > 3 * times[e] for e in events)
+    assert times[-1] > 2 * times[events[0] - 2] > 2.2 * times[0] and all(times[e - 1] > 2 * times[e] for e in events)
     removal = plan_phases(made.phases, 600).stable_start
     assert times[removal - 1] > 30 * times[removal]
     capped = step_times(dataclasses.replace(made, max_gaussians=150_000), 40, 360_000, 100_000)
