@@ -313,7 +313,7 @@ def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
 def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path, monkeypatch):
     """Two clicks at a training camera are its pixels on the command line; a typed length becomes the scale of the files.
 
-    Clicks are matched in training photographs, as by the command; without them, the panel says that depth is the model's.
+    Clicks are matched in training photographs, except at edges, as by the command; without them, depth is the model's.
     """
     run = shutil.copytree(folder / "run", tmp_path / "run")
     record, (tensors, state) = json.loads((run / "config.json").read_text()), load_checkpoint(run)
@@ -326,7 +326,10 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path, monkey
     content = content_of_run(run)
     window = Window(server, dataclasses.replace(content, views=views_of(content)[0]))
     model, panel, asked = window.content.model, window.panel, []
-    monkeypatch.setattr(level, "matched_depth", lambda photographs, *pick: asked.append((*photographs,)) or (2.0, 0.01))
+    monkeypatch.setattr(
+        level, "matched_depth", lambda photographs, *pick: asked.append((*photographs,)) or (2.0 if photographs else None)
+    )
+    monkeypatch.setattr(level, "plane_depth", lambda depth, row, column: (depth[row, column], 9.0 * (row == rows[0]), 0.0, 0.0))
     camera = model.scene_cameras[model.train[0]]
     rows, columns = np.nonzero(warpgs.rasterize(model.gaussians(), camera, model.options()).alpha.detach().numpy() > 0.6)
     eye = SimpleNamespace(wxyz=wxyz_of(camera), position=camera.center, fov=fov_y(camera))
@@ -347,13 +350,13 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path, monkey
         photographs, _ = level.photographs_of(model)
         places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}", photographs) for i in (0, -1)]
         units, error = level.distance(model.normalization, *places)
-        told = f"{units:.4g} units, uncertain by {100 * error:.2g} %; 2 of 2 picks were matched in training photographs"
-        assert measured(-1) == told and asked == [model.train] * 4
+        told = f"{units:.4g} units, uncertain by {100 * error:.2g} %; 1 of 2 picks were matched in training photographs"
+        assert measured(-1) == told + "; at an edge: point 1; pick places away from edges" and asked == [model.train] * 2
         button(window, "length [m]").value = 3.0
         store(None)
         assert "in metres" in panel.measured.content and measured(0, -1).startswith("3 m,")
         window.show(dataclasses.replace(window.content, views={}))
-        assert measured(0, -1).endswith("%; the depth of picks is the model's alone, without photographs")
+        assert "%; 0 of 2 picks were matched in training photographs; at an edge: point 1;" in measured(0, -1)
     finally:
         window.close()
         stop_server(server)

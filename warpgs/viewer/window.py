@@ -387,8 +387,7 @@ class Panel:
             scene.add_icosphere(f"/ruler/{len(places)}", 0.01 * self.window.extent, (255, 221, 51), position=place[0])
             if len(places) == 2:
                 distance, error = level.distance(n, *places)
-                matches = level.matches(places, self.window.photographs())
-                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %{matches}"
+                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %{level.matches(places)}"
 
         def store(_: Any) -> None:
             if len(places) != 2:
