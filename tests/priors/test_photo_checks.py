@@ -57,6 +57,7 @@ def test_exposure_is_measured(sharp, gain):
 def test_faults_are_told_apart_and_what_cannot_be_compared_is_said(sharp):
     """All are compared with two others or more, and all figures lie near 1 without a fault."""
     checks = check_photos(sharp)
+    assert not any(c.compared_with for c in check_photos(sharp, lambda: True))  # a fit that ends does not wait
     assert photo_notes(checks) == []
     assert [c.name for c in checks] == [v.name for v in sharp]
     assert all(c.compared_with >= 2 for c in checks)

@@ -5,8 +5,7 @@ differences in blur and colour, not in content (docs/scenes.md, "Photograph chec
 """
 
 import math
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ import torch
 
 from warpgs.priors.flow import Features, agreeing_matches, nearest_views, sift_features
 from warpgs.priors.networks import single_threaded_opencv, without_ipp
-from warpgs.process import Say, Task, silent
+from warpgs.process import Task
 from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87
@@ -46,8 +45,6 @@ REMEDY = "fix it in the camera, or try --exposure"
 """Remedy for photographs with different colours."""
 MAX_NAMED = 6
 """Number of photographs that a note names."""
-PROGRESS_INTERVAL = 5.0
-"""Seconds between two lines of progress."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ def _places(view: View) -> Places:
     return features, 0.5 * np.log((bands[0] + NOISE) / (bands[1] + NOISE)), colors
 
 
-def _difference(views: Sequence[View], places: Sequence[Places], i: int, j: int) -> np.ndarray | None:
+def _difference(views: Sequence[View], places: Sequence[Places | None], i: int, j: int) -> np.ndarray | None:
     """Return log factors [4] of detail, red, green, blue of photograph i over j, NaN if unknown; None without matches."""
     (first, detail_a, colors_a), (second, detail_b, colors_b) = places[i], places[j]
     ids, _ = agreeing_matches(views[i], views[j], first, second, min_angle=0.0)
@@ -122,21 +119,12 @@ def _typical(differences: list[float]) -> float | None:
     return 0.0 if middle[0] < 0 < middle[1] else min(middle, key=abs)
 
 
-def check_photos(views: Sequence[View], progress: Say = silent) -> list[PhotoCheck]:
-    """Compare each photograph with the nearest ones; ``views`` include those that are held out."""
-    count, began = len(views), time.monotonic()
-    pairs = sorted({(min(i, j), max(i, j)) for i in range(count) for j in nearest_views(views, i, NEIGHBORS)})
+def check_photos(views: Sequence[View], stopped: Callable[[], bool] = lambda: False) -> list[PhotoCheck]:
+    """Compare each photograph with the nearest ones, until ``stopped``; ``views`` include those that are held out."""
+    pairs = sorted({(min(i, j), max(i, j)) for i in range(len(views)) for j in nearest_views(views, i, NEIGHBORS)})
     with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:
-        places = []
-        for place in pool.map(_places, views):
-            places.append(place)
-            if time.monotonic() - began > PROGRESS_INTERVAL:
-                began = time.monotonic()
-                progress(f"comparing photographs: {len(places)} of {count}")
-        found = []
-        for difference in pool.map(lambda pair: _difference(views, places, *pair), pairs):
-            found.append(difference)
-            progress(f"comparing photographs: {len(found)} of {len(pairs)} pairs")
+        places = [*pool.map(lambda view: None if stopped() else _places(view), views)]
+        found = [*pool.map(lambda pair: None if stopped() else _difference(views, places, *pair), pairs)]
     differences: list[list[np.ndarray]] = [[] for _ in views]
     for (i, j), difference in zip(pairs, found, strict=True):
         if difference is not None:

@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -423,7 +423,11 @@ def fit(
         views = itertools.takewhile(lambda _: not stopped.is_set(), read.views)
         # only now: a time budget is measured without another thread
         hashed = threads.submit(lambda: read.fingerprint if isinstance(scene, Scene) else fingerprint(views))
-        compared = threads.submit(_compared, job, stopped)
+        compared = threads.submit(
+            lambda: (
+                [] if job.other_models else check_photos(in_threads(without_masked, (*job.train, *job.test)), stopped.is_set)
+            )
+        )
         trainer, record = _prepare(job, out if resume else None, hashed.result)
         with section("photo checks"):
             if not compared.done():
@@ -533,16 +537,6 @@ def _prepare(job: FitJob, resumed: Path | None, hashed: Callable[[], str]) -> tu
             raise DataError(f"{resumed}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
     return trainer, record or recorded()
-
-
-def _compared(job: FitJob, stopped: threading.Event) -> list[PhotoCheck]:
-    """Return the checks of all photographs, none for camera models whose views cannot be compared; end early once stopped."""
-
-    def going(_: str) -> None:
-        if stopped.is_set():
-            raise CancelledError
-
-    return [] if job.other_models else check_photos(in_threads(without_masked, (*job.train, *job.test)), going)
 
 
 def _finish(job: FitJob, trainer: Trainer, record: dict[str, Any], checks: list[PhotoCheck]) -> FitResult:

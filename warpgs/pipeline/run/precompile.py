@@ -48,7 +48,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             *(update.make_adam_kernel(real, split, update.LANES) for split in (True, False)), neighbours.bound_by_reach,
             # after the first step
             of_renders[0], of_renders[1], walk.make_weights(real, TILE_SIZE), update.squared_errors,
-            scoring(), *of_renders[2:], ssim.make_kernel(real, False, True), deep,
+            ssim.make_kernel(real, False, False), *of_renders[2:], ssim.make_kernel(real, False, True), deep,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in kernels]
     warps = 32 * blend_cuda.WARPS
@@ -79,11 +79,6 @@ def call_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     return list(zip(kernels, (BLOCK, BLOCK, THREADS, TILE_SIZE**2) if cuda else (1, 1, 1, 1)))
 
 
-def scoring() -> wp.Kernel:
-    """Return the kernel that computes SSIM for scores, on the CPU."""
-    return ssim.make_kernel(wp.float32, False, False)
-
-
 @contextlib.contextmanager
 def compiled_ahead(*devices: torch.device, calls: bool = False) -> Iterator[list[tuple[wp.Kernel, int, torch.device]]]:
     """Compile modules that fits on devices, and with ``calls`` `call_kernels`, need and the cache lacks, in threads.
@@ -91,7 +86,8 @@ def compiled_ahead(*devices: torch.device, calls: bool = False) -> Iterator[list
     The threads begin no module after the block, which gets the kernels, block sizes and devices. A launch that needs a module
     waits for it or compiles it, and raises its error.
     """
-    on_cpu = sweep.best, scoring(), neighbours.bound_by_reach  # in fits on CUDA, too
+    # in fits on CUDA, too: depth, scores, limits
+    on_cpu = sweep.best, ssim.make_kernel(wp.float32, False, False), neighbours.bound_by_reach
     jobs = [] if (cpu := torch.device("cpu")) in devices else [(kernel, 1, cpu) for kernel in on_cpu]
     for device, cuda in [(device, device.type == "cuda") for device in devices]:
         jobs += [(*job, device) for job in [*fit_kernels(cuda), *(call_kernels(cuda) if calls else ())]]
