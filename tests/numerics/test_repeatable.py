@@ -1,7 +1,9 @@
-"""The same bits every time: all ops, with any number of threads and on any stream."""
+"""The same bits every time: all ops, with any number of threads and on any stream; and what Warp allows and warpgs does not."""
 
+import ast
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,3 +94,47 @@ def test_atomic_sums_differ_by_rounding_alone(device):
     for _ in range(4):
         for a, b in zip(all_bits(gaussians, cam, deterministic=False), ordered, strict=True):
             assert (a.double() - b.double()).norm() <= (0.0 if device.type == "cpu" else 1e-4) * b.double().norm()
+
+
+KERNELS = sorted((Path(__file__).parents[2] / "warpgs/kernels").glob("*.py"))
+
+
+def warp_functions(tree: ast.AST) -> list[ast.FunctionDef]:
+    """Functions that Warp compiles: its kernels and functions, but not the stubs of native ones."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    names = ("wp.func", "wp.kernel", "kernel")
+    return [f for f in functions if any(ast.unparse(getattr(d, "func", d)) in names for d in f.decorator_list)]
+
+
+def bare_floats(function: ast.FunctionDef) -> list[int]:
+    """Lines with a float literal that is not wrapped in the kernel's own scalar type."""
+    wrapped = set()
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("real", "wp.static", "wp.float64"):
+            wrapped |= {id(n) for n in ast.walk(node)}
+    own = [n for statement in function.body for n in ast.walk(statement)]
+    return [n.lineno for n in own if isinstance(n, ast.Constant) and isinstance(n.value, float) and id(n) not in wrapped]
+
+
+def test_no_adjoint_is_generated_and_no_constant_is_hidden_float32():
+    """Every kernel has enable_backward=False; in functions made by scalar type every float is real(...)."""
+    count = 0
+    for path in KERNELS:
+        text = path.read_text("utf-8")
+        for f in warp_functions(ast.parse(text)):
+            for d in f.decorator_list:
+                if ast.unparse(getattr(d, "func", d)) in ("wp.kernel", "kernel"):
+                    count += 1
+                    # options may be shared: then they are spelled where they are made
+                    said = ast.unparse(d) if "options" not in ast.unparse(d) else text
+                    said = said if ast.unparse(d) != "kernel" else text
+                    assert "enable_backward=False" in said or '"enable_backward": False' in said, f"{path.name}: {f.name}"
+    assert count >= 25
+    checked = 0
+    for path in KERNELS:
+        for maker in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(maker, ast.FunctionDef) and any(a.arg == "real" for a in maker.args.args):
+                for f in warp_functions(maker):
+                    checked += 1
+                    assert not bare_floats(f), f"{path.name}: {f.name}, lines {bare_floats(f)}"
+    assert checked >= 50
