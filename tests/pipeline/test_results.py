@@ -48,12 +48,10 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def scene():
-    """Gaussians, and more views than there are threads and pictures at a time."""
     return initial_gaussians(seeds(), InitConfig(), 3, 1.0, CPU), photos(12)
 
 
 def full(path, data):
-    """Stand in for a write to a full disk."""
     raise ResourceError(f"{path.name}: no space left")
 
 
@@ -245,7 +243,6 @@ def fitted(config: FitConfig = CONFIG, steps: int = 0, out=None) -> Trainer:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A finished fit with its folder, and the first event."""
     out, seen, fit = tmp_path_factory.mktemp("run"), [], fitted()
     with images_kept(fit, NAMES, out):
         draw = fit.strategy.on_event
@@ -326,7 +323,6 @@ def test_events_are_shown_as_they_were_and_figures_add_up(run):
 
 @pytest.mark.usefixtures("tiny")
 def test_story_follows_the_switches(run, tmp_path):
-    """The report names gate, draw and depth as set, and a widened gate; without events it has no such section."""
     fit, out, _ = run
     (out / "sampling" / "own.png").write_bytes(b"an image of the user's own")
     story = sampling_report_of(fit, out)
@@ -384,7 +380,6 @@ def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
 
 @pytest.mark.usefixtures("tiny")
 def test_an_error_of_ours_in_an_image_is_not_hidden(tmp_path, monkeypatch):
-    """Only what the disk does is a note."""
     monkeypatch.setattr(results, "write_bytes", lambda path, data: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         fitted(CONFIG, CONFIG.steps, tmp_path)
