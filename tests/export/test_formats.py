@@ -50,7 +50,6 @@ def model(n=300, degree=3, seed=0):
 
 
 def same_rotation(a, b):
-    """Return the largest difference of unit quaternions, either sign."""
     a, b = (torch.nn.functional.normalize(q.double(), dim=1) for q in (a, b))
     return float(torch.minimum((a - b).abs().amax(1), (a + b).abs().amax(1)).max())
 
@@ -385,7 +384,6 @@ def test_side_files(suffix, tmp_path):
 
 @pytest.mark.parametrize("name", FOREIGN)
 def test_files_of_splat_transform(name):
-    """In any order, with any quaternion of the same shape; its SPZ is in the axes of PLY."""
     if name.endswith("4.spz"):
         pytest.importorskip("zstandard")
     made, back = model(n=20, degree=3, seed=5), read_gaussians(GOLDEN / name)
@@ -503,7 +501,6 @@ def test_counts_chunks_and_numbers_that_lie(tmp_path):
 
 
 def repacked(change):
-    """Return a .sog whose members were changed."""
     members = format_targets.members_of(encoded(".sog"))
     meta = json.loads(members["meta.json"])
     change(meta, members)
@@ -545,7 +542,6 @@ def test_archives_that_lie(change, match, tmp_path):
 
 
 def with_document(change):
-    """Return a .glb whose document was changed."""
     document, body = gltf._split(encoded(".glb"))
     change(document)
     return format_targets.glb(json.dumps(document).encode(), bytes(body))
@@ -596,7 +592,6 @@ HALF = {"rotation": [1, 0, 0, 0]}
 
 
 def placed(node):
-    """Return the matrix [4, 4] of a node."""
     if "matrix" in node:
         return np.array(node["matrix"], float).reshape(4, 4).T
     turn = rotation_matrices(np.array(node["rotation"], float)[[3, 0, 1, 2]] / np.linalg.norm(node["rotation"]))
@@ -644,7 +639,6 @@ def test_nodes_place_gaussians(nodes, roots, wanted, tmp_path):
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_files_say_that_they_are_antialiased(suffix, tmp_path):
-    """Those that can; reading them warns, once, and only then."""
     for antialiased in (True, False):
         path = tmp_path / f"{antialiased}{suffix}"
         write_gaussians(path, model(), units="file", antialiased=antialiased)
@@ -821,7 +815,6 @@ TETRAHEDRON = Mesh(
 
 
 def glb(path):
-    """Return the document and the binary chunk of a .glb file, whose lengths are checked."""
     data = path.read_bytes()
     magic, version, size, length, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON") and length % 4 == 0
@@ -909,7 +902,6 @@ def test_glb_holds_the_texture(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
-    """Numbers that are not finite, triangles of missing vertices, other suffixes; what is written states its origin."""
     path = tmp_path / f"a{suffix}"
     bad = TETRAHEDRON.vertices.copy()
     bad[1, 1] = np.nan

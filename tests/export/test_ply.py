@@ -182,7 +182,6 @@ def test_a_failing_disk_leaves_the_old_file(tmp_path, monkeypatch, fsync, words)
 @pytest.mark.parametrize("form", ["ascii", "binary_big_endian", "binary_little_endian"])
 @pytest.mark.parametrize("eol", [b"\n", b"\r\n"])
 def test_files_of_other_programs(tmp_path, form, eol):
-    """Text and either byte order, with a blank at the end of lines, comments in any encoding, and an element before."""
     model, path = make(5, 2), tmp_path / "a.ply"
     write_ply(path, model, Normalization())
     lines, body = split(path)
