@@ -174,20 +174,6 @@ def test_extensions_of_spz(version, system, name, tmp_path):
         read_gaussians(path)
 
 
-@pytest.mark.parametrize("axis", ["x", "z"])
-def test_a_half_turn_turns_colours_and_shapes(axis):
-    made = arrays_of(model(degree=4))
-    turned = half_turn(made, axis)
-    signs = torch.tensor([1.0 if a == axis else -1.0 for a in "xyz"])
-    directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=torch.Generator().manual_seed(1)), dim=1)
-    for d in directions:
-        before = torch.einsum("k,nkc->nc", basis(d[None])[0], torch.from_numpy(made["sh"]))
-        after = torch.einsum("k,nkc->nc", basis((d * signs)[None])[0], torch.from_numpy(turned["sh"]))
-        assert torch.allclose(before, after, atol=1e-5)
-    for name, array in half_turn(turned, axis).items():
-        assert np.array_equal(array, made[name])
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".gltf", ".splat"])
 def test_the_page_names_the_bytes_of_a_gaussian(suffix, tmp_path):
     """Of formats whose size does not depend on the values."""
