@@ -261,22 +261,6 @@ def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 3
 
 
 @pytest.mark.usefixtures("tiny")
-def test_uniform_events_show_no_scores(tmp_path):
-    """Nor a disparity, as no prior was made; the words say that nothing was scored."""
-    fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, strategy="sampling"), CPU), []
-    fit.strategy.on_event = lambda step, views: seen.append(views)
-    while not seen:
-        fit.advance()
-    drawn, view = seen[0][1], fit.views[1]
-    assert fit.disparities == [] and not drawn.scores
-    sheet = view_sheet("01.png", 8, view, None, drawn, fit.strategy)
-    one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * CONTACT_HEAD) + round(1.25 * TITLE_SIZE)
-    assert sheet.shape[0] == one_row + 2 * CONTACT_MARGIN + 18  # render, image, gate, pixels, words
-    words = sampling_report_of(fit, tmp_path)[0]
-    assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
-
-
-@pytest.mark.usefixtures("tiny")
 def test_events_are_shown_as_they_were_and_figures_add_up(run):
     """The first, and the first of the second half of phase 2; each has a file with a sheet for each of the three views."""
     phases = plan_phases(PhaseConfig(2000, 3000), 10_000)
