@@ -66,7 +66,6 @@ def camera(width: int = 18, height: int = 17, cameras: int | None = None, dtype=
 
 
 def leaves(gaussians: Gaussians) -> Gaussians:
-    """A copy whose tensors are leaves that require gradients."""
     return Gaussians(**{n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()})
 
 
@@ -85,13 +84,11 @@ def of_kind(kind: str, stored: Gaussians):
 
 
 def shapes_of(g: Gaussians) -> torch.Tensor:
-    """Return the covariances [N, 3, 3] in float64."""
     axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)))
     return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
 
 
 def finite(*tensors) -> bool:
-    """Whether no number of any tensor is NaN or infinite."""
     return all(bool(torch.isfinite(t).all()) for t in tensors)
 
 

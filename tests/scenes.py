@@ -37,7 +37,6 @@ def ring(count: int, width: int = 40, height: int = 32) -> list[Camera]:
 
 
 def photos(count: int = 6, width: int = 40, height: int = 32) -> list[View]:
-    """Views of the three Gaussians."""
     gaussians = three_gaussians()
     return [
         View(f"{i:02d}.png", camera, rasterize(gaussians, camera).rgb.clamp(0, 1).numpy())

@@ -2,7 +2,6 @@
 
 import functools
 import math
-import re
 import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -19,7 +18,6 @@ from bench.lib.one_fit import Fit, config_of, is_peer, peer_settings
 from bench.lib.points import exponent
 from bench.lib.pool import finished
 from bench.lib.preset_table import rival, sizes_table, tables
-from bench.lib.rivals_page import arms_table, headings, reruns_table, rows_of, scene_of
 from bench.lib.scenes import PHOTOGRAPHS, ROWS, Row, folds, left_out, photographs, row_of, scene_at
 from tests import gaussians as sets
 from tests.scenes import photos
@@ -76,7 +74,6 @@ def first(count: int) -> Gaussians:
 
 
 def test_gsplat_is_trained_as_its_example_trainer_does(fake_gsplat):
-    """Settings of the strategy, degree by step, rate of the means from its start to a hundredth; the loss falls."""
     views = photos(3)
     s = gsplat_trainer.Settings(steps=12, cap=123, sh_every=4)
     params = gsplat_trainer.train(views, first(200), s, seed=1, scale=2.0, size=3.0)
@@ -128,7 +125,6 @@ def test_units_and_the_default_strategy_of_gsplat(fake_gsplat, monkeypatch):
 
 
 def test_rows_are_named_or_given(tmp_path):
-    """A name, or a folder with its split and downscale; anything else is an error that lists them."""
     assert row_of("fern:3") is ROWS["fern:3"] and row_of("a/b@llff:3") == Row("a/b", "llff:3")
     assert row_of("a/b@every:8@2") == Row("a/b", "every:8", 2)
     for name in ("fern:4", "a@", "@llff:3", "a@all@0"):
@@ -193,7 +189,6 @@ def test_a_fit_gives_a_row_and_the_peer_starts_from_the_same_points(demo, fake_g
 
 
 def results(row: str, preset: str, scores: list[float], **more) -> list[dict]:
-    """Rows of a preset, one for each seed."""
     rest = {"ssim": 0.5, "gaussians": 10, "bytes": 2000, "steps": 7, "setup": 1.0, "training": 2.0, "left_out": ""} | more
     return [{"row": row, "preset": preset, "seed": s, "psnr": p} | rest for s, p in enumerate(scores)]
 
@@ -231,7 +226,6 @@ class Task:
 
     @property
     def key(self) -> dict:
-        """What tells its row from others."""
         return {"seed": self.seed}
 
 
@@ -288,7 +282,6 @@ def test_all_arms_share_start_background_and_degree(views):
 
 
 def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tmp_path):
-    """Arms without their network or gsplat are left out; a path comes from the environment, and its name stays in the row."""
     monkeypatch.delenv(NETWORK, raising=False)
     monkeypatch.setattr(arm_fits, "find_spec", lambda name: None)
     monkeypatch.setattr(arm_fits, "plan", lambda row, preset, seed, folder, place, count, device: [
@@ -313,42 +306,7 @@ def test_first_seeds_come_before_further_ones_and_long_fits_last(monkeypatch, tm
 
 
 @pytest.mark.usefixtures("registries_as_they_were")
-def test_the_page_pairs_each_method_with_its_base():
-    """Pairs by seed with the first arm or the one above; few seeds have no interval; other steps stand beside the first arm."""
-    arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)), Arm("c", "mcmc:steps=7"))
-    rows = results("fern:3", "default", [20.0, 20.2, 20.1], steps=4500)
-    rows += results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2], steps=20)
-    rows += results("fern:3", "mcmc:steps=7", [19.0, 19.2])
-    rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
-    table = arms_table(arms, rows, ["fern:3"], above=False).splitlines()
-    assert table[0].startswith("| method | fern: steps | PSNR / SSIM | difference |")
-    assert "| a | 4,500 | 20.10 / 0.500 |  |" in table
-    low, high = (1.1 + sign * 0.1 / math.sqrt(3) * 6.2053 for sign in (-1, 1))  # Student's t, 97.5 % of two rows, two degrees
-    assert f"| b | 20 | 21.20 / 0.500 | +1.10 [{low:+.2f}, {high:+.2f}] |" in table
-    assert "| c | 7 | 19.10 / 0.500 (2 seeds) | -1.00 |" in table
-    again = arms_table((*arms, Arm("d", "quick")), rows, ["fern:3"], above=True).splitlines()
-    assert again[-2:] == ["| c | 7 | 19.10 / 0.500 (2 seeds) | -2.10 |", "| d |  |  |  |"]
-    assert rows_of([{"row": r} for r in ("llff/room@llff:3", "horns:3", "fern:3")]) == ["fern:3", "horns:3", "llff/room@llff:3"]
-    assert [scene_of(n) for n in ("fern:3", "llff/room@llff:3")] == ["fern", "room"]
-    assert headings(["fern:3", "llff/room@llff:3"]) == ["fern", "room"] and headings(["fern:3"]) == ["fern"]
-    assert headings([f"dtu_scan37@dtu:{n}@4" for n in (3, 6)]) == ["dtu:3", "dtu:6"]
-
-
-def test_a_method_far_below_its_authors_code_is_not_reproduced():
-    """The distance is of means over seeds; more than 0.4 dB on one scene decides; a scene without ours has none."""
-    arms = (Arm("FSGS", "fsgs"), Arm("CoR-GS", "cor"), Arm("a", "default"))
-    rows = results("fern:3", "fsgs", [21.4, 21.6]) + results("horns:3", "fsgs", [21.0]) + results("fern:3", "cor", [22.0])
-    assert reruns_table(arms, rows, ["fern:3", "horns:3"]).splitlines()[2:] == [
-        "| FSGS | 21.90 / 0.721 | -0.40 | 20.19 / 0.716 | +0.81 | reproduced |",
-        "| CoR-GS | 22.29 / 0.745 | -0.29 | 19.02 / 0.689 |  | reproduced |",
-    ]
-    rows += results("horns:3", "cor", [18.6])
-    assert reruns_table(arms, rows, ["fern:3", "horns:3"]).splitlines()[3].endswith("| -0.42 | not reproduced |")
-
-
-@pytest.mark.usefixtures("registries_as_they_were")
 def test_arms_name_their_steps_and_settings_and_steps_are_chosen_on_views_left_out():
-    """Numbers of steps are read from the preset; settings of a strategy of one's own come after it; views left out choose."""
     for arm in (a for arms in ARMS.values() for a in arms if a.steps):
         assert len(arm.steps) > 1 and arm.steps == tuple(sorted(arm.steps))
         for steps in arm.steps:
@@ -441,7 +399,6 @@ def test_a_short_schedule_is_the_whole_one_in_proportion():
 
 
 def test_a_rival_is_scored_on_the_way_and_its_clock_stands_still(demo, fake_gsplat, monkeypatch, tmp_path):
-    """From the points that were written; the time of scores is in no time, and the last score is that of the last step."""
     fit, points = Fit("r", "gsplat", 1, demo, split_spec(8), "", 1, "cpu"), tmp_path / "p.npz"
     made = score_times.write_points(fit, points)
     honest, clock = score_times.scores, SimpleNamespace(now=100.0)
@@ -461,23 +418,6 @@ def test_a_rival_is_scored_on_the_way_and_its_clock_stands_still(demo, fake_gspl
     times = [row["setup"], *(at["seconds"] for at in row["curve"]), row["seconds"]]
     assert times == sorted(times) and times[-1] < 20, "scores took 2000 s"
     assert 3 < row["curve"][0]["psnr"] < row["psnr"] < 40
-
-
-def test_the_first_time_at_which_a_score_is_reached():
-    """By any fit of a program or on its way; with the time of the first points where they are not its own."""
-    ours = {"row": "a", "program": "warpgs", "gaussians": 5, "setup": 1.0}
-    its = {"row": "a", "program": "gsplat", "points_seconds": 4.0}
-    rows = [
-        ours | {"steps": 10, "seconds": 8.0, "psnr": 24.0}, ours | {"steps": 20, "seconds": 12.0, "psnr": 26.0},
-        its | {"steps": 50, "seconds": 9.0, "psnr": 23.0, "curve": []},
-        its | {"steps": 100, "seconds": 30.0, "psnr": 25.0, "curve": [{"seconds": 11.0, "step": 30, "psnr": 23.5}]},
-    ]  # fmt: skip
-    lines = score_times.table(rows, (2.0, 1.0, 0.0)).splitlines()[2:]
-    assert lines == ["| a | gsplat | 25.00 | 9.0 | 13.0 | 8.0 | 30.0 | 34.0 | 8.0 | 30.0 | 34.0 | 12.0 |"]
-    chart = score_times.picture(rows)
-    marks = [float(y) for y in re.findall(r'y="([\d.]+)" font-size="11" text-anchor="end"', chart)]
-    assert len(marks) == 5 and np.diff(marks) == pytest.approx(-75), "decibels are evenly spaced, 23 to 27"
-    assert chart.count("stroke-dasharray") == 1 and ">gsplat<" in chart and ">26<" in chart and "linear" not in chart
 
 
 def test_growth_is_the_slope_of_logarithms():

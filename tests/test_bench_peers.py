@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from bench.lib import gsplat_calls, inputs, judge, peers, rasterizers, rasterizers_page
+from bench.lib import gsplat_calls, inputs, judge, peers, rasterizers
 from bench.lib.rasterizers import Drawing
 from warpgs import RasterizeOptions, rasterize
 from warpgs.compat import gsplat as compat
@@ -21,7 +21,6 @@ CPU = torch.device("cpu")
 
 
 def dense(g: Gaussians, camera: Camera, rule: Rule = RULES["exact"]) -> Drawing:
-    """The drawing of plain torch."""
     leaves = {n: t.detach().clone().requires_grad_() for n, t in g.tensors().items()}
     return Drawing(lambda: peers.dense_rasterize(Gaussians(**leaves), camera, rule), leaves)
 
@@ -90,35 +89,7 @@ def test_gsplat_gets_what_it_asks_for(monkeypatch):
     assert told == [(1, False, {}), (None, False, {"camera_model": "ortho"})]
 
 
-def result_of_others() -> dict:
-    """A result as `bench.peers.against_others` writes it, of one configuration."""
-    programs = {"warpgs": 1.0, "warpgs atomic": 0.9, "gsplat dense": 2.0, "Faster-GS": 1.25}
-    times = {d: {who: {"median": t * k} for who, t in programs.items()} for d, k in (("image", 1), ("forward", 2), ("both", 5))}
-    size = {"gaussians": 1000, "visible": 900, "instances": 4000, "width": 320, "height": 240}
-
-    def row(channels: int, factor: int) -> dict:
-        gpu, wall = (
-            {d: {who: {"median": k * m["median"]} for who, m in own.items()} for d, own in times.items()}
-            for k in (factor, 2 * factor)
-        )
-        values = {"gpu_ms": gpu, "wall_ms": wall, "peak_mib": dict.fromkeys(programs, 3.5 * factor)}
-        return {"configuration": "1k at 320x240", **size, "channels": channels, **values}
-
-    steps = {"warpgs graph": {"median": 2.0}, "gsplat": {"median": 8.0}}
-    return {"rows": [row(3, 1) | {"step_wall_ms": steps}, row(32, 2)]}
-
-
-def test_tables_of_other_rasterizers():
-    """Each program has its row; ratios are right."""
-    result = result_of_others()
-    made = rasterizers_page.times_table(result)
-    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 6.25 | 2.5 | 12.5 | 3.5 |" in made
-    assert made.count("gsplat dense") == 1, "only rows with three channels"
-    assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in rasterizers_page.steps_table(result)
-
-
 def test_the_judge_of_other_programs_finds_what_differs():
-    """Order, sign of a quaternion and half turns about own axes are the same; each value by more than its step is not."""
     generator = np.random.default_rng(0)
     ours = {n: generator.normal(size=(40, k)) for n, k in (("means", 3), ("quats", 4), ("log_scales", 3))}
     ours |= {"logit_opacities": generator.normal(size=40), "sh": generator.normal(size=(40, 4, 3))}

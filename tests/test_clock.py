@@ -10,8 +10,6 @@ from warpgs.clock import Clock, largest, section, timed, times_line
 
 
 class Time:
-    """A time that moves only when told."""
-
     now = 100.0
 
     def __call__(self) -> float:
@@ -74,7 +72,6 @@ def test_each_thread_has_its_own_clock(time):
 
 
 def test_the_largest_parts_are_named_once():
-    """Phases are one part in the short line; the long line has all."""
     found = {"import": 4.0, "steps (phase 1)": 3.0, "steps (phase 2)": 3.4, "report": 2.0, "other": 0.1, "total": 12.5}
     assert largest(found) == "steps 6 s, import 4 s, report 2 s"
     parts = "import 4.00 s, steps (phase 1) 3.00 s, steps (phase 2) 3.40 s, report 2.00 s, other 0.10 s"

@@ -47,7 +47,6 @@ def test_the_files_of_the_page_are_a_preset(tmp_path, monkeypatch):
 
 @pytest.fixture
 def module():
-    """The example's module."""
     return sys.modules[STRATEGIES.load(NAME).__module__]
 
 
@@ -73,7 +72,6 @@ def test_a_continued_fit_equals_an_uninterrupted_one(module):
 
 
 def error(trainer: Trainer, table) -> float:
-    """Return the summed mean absolute error of a model on the training views."""
     options = trainer.context.render_options()
     with torch.no_grad():
         return sum(float((rasterize(table.gaussians, v.camera, options).rgb - v.image).abs().mean()) for v in trainer.views)

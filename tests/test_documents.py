@@ -75,7 +75,6 @@ def test_named_flags_are_there():
 
 
 def test_the_page_on_presets_says_what_the_rule_chooses():
-    """The columns of its table are the settings for so many views."""
     text = text_of("docs/presets.md")
     rows = [[c.strip() for c in line.split("|")[3:-1]] for line in text[text.index("| setting | rule |") :].splitlines()[:12]]
     counts = [int(cell.split()[0]) for cell in rows[0]]
@@ -140,12 +139,10 @@ NAMED_NUMBERS = {
 
 
 def numbers_in(text: str) -> set[str]:
-    """Return the numbers with a decimal point in a text."""
     return set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.]*\d)", text))
 
 
 def values_in(settings: object) -> set[float]:
-    """Return all numbers of nested settings."""
     if isinstance(settings, dict):
         return set().union(*map(values_in, settings.values()))
     if isinstance(settings, (list, tuple)):
@@ -292,7 +289,6 @@ def test_picture_and_scores_of_the_readme_and_the_quickstart():
 
 
 def test_the_hosted_checks_are_those_of_the_readme():
-    """Both commands, each system, and every Python that the package allows."""
     text = text_of(".github/workflows/test.yml")
     commands = re.findall(r"^(make \w+) ", text_of("README.md"), re.MULTILINE)
     assert re.findall(r"- run: (make \w+)", text) == commands == ["make demo", "make test"]
@@ -315,7 +311,6 @@ def test_the_commands_call_what_a_virtual_environment_has(tmp_path, system, fold
 
 
 def messages() -> list[str]:
-    """Return all string literals of the package, with ... where a value is filled in."""
     found = []
     for path in sorted((ROOT / "warpgs").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):

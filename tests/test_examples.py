@@ -33,7 +33,6 @@ SMALL = {
 
 
 def run(name: str, arguments: list[str]) -> float:
-    """Run an example's main as a script of its own."""
     return runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name=f"example_{name}")["main"](arguments)
 
 

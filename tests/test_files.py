@@ -104,7 +104,6 @@ def test_a_short_file_or_a_failed_check_leaves_the_old_one(tmp_path, monkeypatch
 
 
 def test_windows_replaces_no_open_file(tmp_path, monkeypatch):
-    """The message says what to do."""
     path = tmp_path / "a.png"
 
     def in_use(*names, **at):
@@ -220,7 +219,6 @@ ELSEWHERE = {
 
 
 def writers(tree: ast.AST) -> set[str]:
-    """Calls in a module that write files."""
     found = set()
     for node in (n for n in ast.walk(tree) if isinstance(n, ast.Call)):
         name = ast.unparse(node.func)
@@ -489,7 +487,6 @@ with temporary_folder(), shared_locks() as locks:
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
-    """A folder of results, and one for temporary files."""
     for name in ("X", "tmp"):
         (tmp_path / name).mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
@@ -500,7 +497,6 @@ def places(tmp_path, monkeypatch):
 
 
 def started(code, *words, stdin=subprocess.PIPE):
-    """Start Python, and wait for its first line."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     words = [sys.executable, "-c", code, *map(str, words)]
     process = subprocess.Popen(words, stdin=stdin, stdout=subprocess.PIPE, text=True, env=environment)

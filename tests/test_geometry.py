@@ -92,7 +92,6 @@ def test_texts_of_records_have_shapes():
 
 
 def test_mistakes_are_named(tmp_path):
-    """Unknown units, scene units without a scene, no similarity, numbers that are not finite, and files of others."""
     g = cloud(3)
     with pytest.raises(UsageError, match="units 'metres' is not one of scene, file"):
         convert_gaussians(g, N, "scene", "metres")

@@ -177,7 +177,6 @@ def test_settings_of_ones_own_travel_through_json(registry):
 
 
 def test_an_error_in_own_code_names_its_file(demo, tmp_path, capsys):
-    """What a user's own class raises is not called a defect of warpgs: the line says which file and line."""
     own = tmp_path / "mine.py"
     code = "class Mine(warpgs.Strategy):\n    def columns(self):\n        raise ValueError('my own bug')\n"
     own.write_text(f"import warpgs\n\n\n{code}")
@@ -244,7 +243,6 @@ def test_a_wrong_result_of_a_part_names_its_class_and_method(part, method, found
 
 @pytest.mark.parametrize("method, found", [("probe", True), ("read", None), ("read", []), ("cameras", None)])
 def test_a_wrong_result_of_a_reader_or_module_after_the_fit_is_named(method, found, tmp_path):
-    """A reader says what it found; a module returns a camera for each view."""
     if method == "cameras":
         module = type("Own", (ViewModule,), {"cameras": always(found)})()
         call = functools.partial(LearnedViews([module], photos(2), torch.device("cpu")).cameras, {}, (), ())

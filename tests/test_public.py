@@ -188,7 +188,6 @@ STILL_THERE = {
     ],
 )
 def test_names_that_stayed_give_what_they_gave(light, pixel, mean):
-    """A camera, a pixel and the mean colour of a view, recorded before the modules were merged; and the pixels of a PNG."""
     camera = camera_path(9, 64, 48)[2]
     assert camera.viewmat[:3, 3] == pytest.approx([0.8011, 0.2279, 0.0505], abs=1e-4)
     image = render(still_life(), Light(*light), camera.K, camera.viewmat, 64, 48, 1)
@@ -198,7 +197,6 @@ def test_names_that_stayed_give_what_they_gave(light, pixel, mean):
 
 
 def test_what_is_gone_names_its_new_place(monkeypatch):
-    """A module, a module of a folder that is gone or became a file, and a name; other names of the module stay."""
     gone = {name: {"Thing": "warpgs.train.Thing"} for name in ("nowhere.at_all", "version", "version.deep")}
     monkeypatch.setattr(faces, "OLD", gone)
     monkeypatch.delitem(sys.modules, "warpgs.version")
@@ -341,8 +339,6 @@ class Same:
 
 
 def test_classes_of_one_name_keep_their_own_fields():
-    """Nested in a class, in a function, derived, or without source."""
-
     @dataclasses.dataclass
     class Local(Same):
         """A class of a function."""

@@ -38,7 +38,6 @@ def release(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
 
 
 def metadata(wheel: Path) -> Message:
-    """The metadata of a wheel."""
     with zipfile.ZipFile(wheel) as archive:
         return email.message_from_bytes(archive.read(f"warpgs-{__version__}.dist-info/METADATA"))
 

@@ -26,7 +26,6 @@ pytestmark = pytest.mark.usefixtures("registries_as_they_were")
 
 
 def preset(name: str) -> FitConfig:
-    """Return the settings of a rival's file, by the preset of the file's name."""
     return preset_settings(f"{FOLDER / name}.py:{name}")[0]
 
 
@@ -48,19 +47,16 @@ def advanced(trainer: Trainer, until: int = 3) -> Trainer:
 
 
 def module(config: FitConfig):
-    """Return the module of a preset's strategy."""
     return sys.modules[STRATEGIES.find(config.strategy).__module__]
 
 
 def replaced(table: Table, gaussians: Gaussians) -> None:
-    """Replace the rows of a table by fewer Gaussians."""
     table.apply(DensityUpdate(torch.arange(len(gaussians))))
     for name, t in gaussians.tensors().items():
         table.params[name].detach().copy_(t)
 
 
 def rows(count: int) -> Gaussians:
-    """Return Gaussians of scales 1, 2 and 4 in a row along x."""
     return Gaussians(
         means=torch.arange(count)[:, None] * torch.tensor([[1.0, 0.0, 0.0]]),
         quats=torch.tensor([[math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]]).repeat(count, 1),  # x turns to y

@@ -25,14 +25,12 @@ OTHER_MAKER = {"MKL_CBWR": "COMPATIBLE", "OPENBLAS_CORETYPE": "Zen", "OPENCV_IPP
 
 
 def run(out: Path, *flags: str, **environment: str) -> dict:
-    """Return the row of a run on a tiny scene, in a process of its own."""
     command = [sys.executable, "-m", "bench.fits.same_bits", "--out", str(out), "--size", "64", "48", "--steps", "12", *flags]
     subprocess.run(command, cwd=ROOT, env=os.environ | environment, check=True, capture_output=True)
     return result_file.read(out)["rows"][-1]
 
 
 def fit_differs(a: dict, b: dict) -> list[str]:
-    """Return the names of stages that differ, but for those of single functions."""
     return [n for n in same_bits.differing(a, b) if not n.startswith(same_bits.LIBRARIES)]
 
 
@@ -83,7 +81,6 @@ def test_losses_do_not_depend_on_the_number_of_threads():
 
 
 def row(label: str, stages: dict, device: str = "cpu", **more) -> dict:
-    """A row of a result."""
     machine = {"device": device, "name": "P", "threads": 2}
     return {"label": label, "machine": machine, "versions": {"torch": "2"}, "arguments": {}, "stages": stages} | more
 

@@ -29,7 +29,6 @@ EXPLAINED = ("docutils",)
 
 
 def plain(requirement: str) -> str:
-    """The name in a requirement, as package indexes write it."""
     return re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", requirement)[0]).lower()
 
 

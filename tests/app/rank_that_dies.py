@@ -10,7 +10,6 @@ from warpgs.ranks import join, last_words
 
 
 def main() -> int:
-    """Fit; returns an exit code."""
     rank, step = map(int, sys.argv[1:3])
     request = request_of(sys.argv[3:], "")
     ranks = join(request.device)

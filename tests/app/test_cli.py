@@ -73,7 +73,6 @@ def test_a_fit_starts_without_libraries_that_it_does_not_need_yet(scene, tmp_pat
 
 
 def test_run_folder_holds_what_it_promises(run, scene):
-    """Configuration, logs, scores, checkpoint, PLY, pictures, report; and the scores are the same everywhere."""
     metrics = json.loads((run / "metrics.json").read_text())
     config = json.loads((run / "config.json").read_text())
     assert len(metrics["views"]) == len(config["test"]) > 0 and set(config["train"]).isdisjoint(config["test"])
@@ -104,7 +103,6 @@ def test_run_folder_holds_what_it_promises(run, scene):
 
 
 def test_eval_repeats_the_scores_and_measures_lpips(run, capsys, tmp_path):
-    """With weights, LPIPS by net and mode stand in eval.json; a file that holds none is refused first."""
     assert main(["eval", str(run), "--device", "cpu"]) == 0
     metrics = json.loads((run / "metrics.json").read_text())
     assert f"PSNR {metrics['test']['psnr']:.2f} dB" in capsys.readouterr().out.splitlines()[-1]
@@ -142,7 +140,6 @@ def test_render_paths(run, tmp_path, path, pictures, capsys, monkeypatch):
 
 @pytest.mark.parametrize("words", [["--color", "coverage"], ["--points", "start", "--background", "black"], ["--no-cameras"]])
 def test_plot(run, tmp_path, capsys, words):
-    """A PNG of the size that is asked for."""
     target = tmp_path / "a.png"
     assert main(["plot", str(run), "--out", str(target), "--size", "320x240", "--device", "cpu", *words]) == 0
     image, said = cv2.imread(str(target)), capsys.readouterr().out
@@ -151,7 +148,6 @@ def test_plot(run, tmp_path, capsys, words):
 
 
 def test_choices_that_cannot_be_are_refused(run, capsys):
-    """With what can be given."""
     for words, why in (
         ("--points stars", "'start')"), ("--color red", "'coverage')"), ("--size 9 9", "64 to 8192"),
         ("--background red", "'black')"), ("--out a.jpg", "is a .png"),
@@ -217,7 +213,6 @@ def test_names_that_files_cannot_hold_and_data_that_have_changed(scene, run, tmp
 
 
 def failure(capsys, code: int, *arguments: str) -> str:
-    """Run a command that must fail with that code and one line on stderr; returns the line."""
     assert main(list(arguments)) == code
     text = capsys.readouterr().err.strip()
     assert text.splitlines()[-1].startswith("warpgs: ") and "Traceback" not in text and "internal error" not in text
@@ -225,7 +220,6 @@ def failure(capsys, code: int, *arguments: str) -> str:
 
 
 def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys):
-    """2 usage, 3 data, 4 resources; each names the thing and the way out, and no folder is left behind."""
     out = str(tmp_path / "new")
     assert "unknown command 'photo'; choose one of demo" in failure(capsys, 2, "photo")
     for word, command in {"train": "fit", "run": "fit", "video": "render", "Movie": "render", "clean": "prune"}.items():
@@ -283,7 +277,6 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     ],
 )
 def test_words_in_the_wrong_place_get_the_right_command(run, tmp_path, monkeypatch, capsys, words, hint):
-    """Nothing is written."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.html").touch()
     code = 3 if words.startswith("view") else 2
@@ -405,7 +398,6 @@ def printed(capsys, *words):
 
 @pytest.mark.parametrize("words", [["fit", "scene", "-h"], ["--help"]])
 def test_help_fits_one_screen(capsys, words):
-    """And every command has one purpose."""
     lines = printed(capsys, *words)
     assert sorted(name for names in GROUPS.values() for name in names) == sorted(COMMANDS)
     if words == ["--help"]:
@@ -467,7 +459,6 @@ def test_flags_and_their_defaults_are_those_of_the_parser(flag, word, default):
 
 
 def test_what_is_registered_is_in_the_help(capsys, monkeypatch):
-    """Presets on one screen; these, strategies, loss terms, readers and camera models where every flag is."""
     monkeypatch.setattr(PRESETS, "_made", dict(PRESETS._made))
     monkeypatch.setattr(PRESETS, "_about", dict(PRESETS._about))
     PRESETS.register("mine", PRESETS["quick"], "one of my own")

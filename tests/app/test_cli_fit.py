@@ -92,7 +92,6 @@ def test_every_setting_is_a_flag_with_its_own_help(capsys, monkeypatch):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_without_flags_the_settings_are_the_presets(preset):
-    """Nothing is lost or changed on the way through the command line, types included."""
     found = parsed("--preset", preset)
     assert found == PRESETS[preset] and found.fingerprint() == PRESETS[preset].fingerprint()
     assert type(found) is FitConfig and type(found.init) is type(PRESETS[preset].init)
@@ -146,7 +145,6 @@ def plugged(tmp_path_factory):
 
 
 def test_settings_of_plug_ins_reach_the_run(plugged, capsys):
-    """Given as FILE.py:Class, with flags of their own that stand in the help and in config.json."""
     folder, command, named = plugged
     config = json.loads((folder / "run" / "config.json").read_text())["config"]
     assert config["strategy"].endswith("mine.py:SlowGrowth") and config["strategy_config"] == {"rate": 0.75}

@@ -131,7 +131,6 @@ def test_caches_that_cannot_be_used(monkeypatch, tmp_path):
 
 
 def test_encoder_disk_and_memory(monkeypatch, tmp_path):
-    """An encoder that writes nothing, little disk and little memory are notes."""
     writer = types.SimpleNamespace(isOpened=lambda: False, release=lambda: None)
     monkeypatch.setattr("cv2.VideoWriter", lambda *a: writer)
     (f,) = doctor._video()
@@ -162,8 +161,6 @@ def test_eighty_columns_keep_the_keys_whole():
 
 
 def test_a_failed_check_is_a_finding(monkeypatch):
-    """It does not end the others."""
-
     def _odd_check():
         raise RuntimeError("no such thing")
 

@@ -213,7 +213,6 @@ def test_the_error_of_a_rank_is_printed_whole(monkeypatch):
 
 
 def test_the_end_of_a_process_is_seen(monkeypatch):
-    """This one is there, and one that has ended is gone, also while its parent has not asked."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     if hasattr(os, "waitid"):
         os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and stays for its parent to ask

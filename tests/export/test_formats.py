@@ -50,7 +50,6 @@ def model(n=300, degree=3, seed=0):
 
 
 def same_rotation(a, b):
-    """Return the largest difference of unit quaternions, either sign."""
     a, b = (torch.nn.functional.normalize(q.double(), dim=1) for q in (a, b))
     return float(torch.minimum((a - b).abs().amax(1), (a + b).abs().amax(1)).max())
 
@@ -173,20 +172,6 @@ def test_extensions_of_spz(version, system, name, tmp_path):
     written(records.replace(struct.pack("<II", 4, system), struct.pack("<II", 4, 17)))
     with pytest.raises(DataError, match="coordinate system 17 is unknown"):
         read_gaussians(path)
-
-
-@pytest.mark.parametrize("axis", ["x", "z"])
-def test_a_half_turn_turns_colours_and_shapes(axis):
-    made = arrays_of(model(degree=4))
-    turned = half_turn(made, axis)
-    signs = torch.tensor([1.0 if a == axis else -1.0 for a in "xyz"])
-    directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=torch.Generator().manual_seed(1)), dim=1)
-    for d in directions:
-        before = torch.einsum("k,nkc->nc", basis(d[None])[0], torch.from_numpy(made["sh"]))
-        after = torch.einsum("k,nkc->nc", basis((d * signs)[None])[0], torch.from_numpy(turned["sh"]))
-        assert torch.allclose(before, after, atol=1e-5)
-    for name, array in half_turn(turned, axis).items():
-        assert np.array_equal(array, made[name])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".gltf", ".splat"])
@@ -385,7 +370,6 @@ def test_side_files(suffix, tmp_path):
 
 @pytest.mark.parametrize("name", FOREIGN)
 def test_files_of_splat_transform(name):
-    """In any order, with any quaternion of the same shape; its SPZ is in the axes of PLY."""
     if name.endswith("4.spz"):
         pytest.importorskip("zstandard")
     made, back = model(n=20, degree=3, seed=5), read_gaussians(GOLDEN / name)
@@ -503,7 +487,6 @@ def test_counts_chunks_and_numbers_that_lie(tmp_path):
 
 
 def repacked(change):
-    """Return a .sog whose members were changed."""
     members = format_targets.members_of(encoded(".sog"))
     meta = json.loads(members["meta.json"])
     change(meta, members)
@@ -545,7 +528,6 @@ def test_archives_that_lie(change, match, tmp_path):
 
 
 def with_document(change):
-    """Return a .glb whose document was changed."""
     document, body = gltf._split(encoded(".glb"))
     change(document)
     return format_targets.glb(json.dumps(document).encode(), bytes(body))
@@ -596,7 +578,6 @@ HALF = {"rotation": [1, 0, 0, 0]}
 
 
 def placed(node):
-    """Return the matrix [4, 4] of a node."""
     if "matrix" in node:
         return np.array(node["matrix"], float).reshape(4, 4).T
     turn = rotation_matrices(np.array(node["rotation"], float)[[3, 0, 1, 2]] / np.linalg.norm(node["rotation"]))
@@ -644,7 +625,6 @@ def test_nodes_place_gaussians(nodes, roots, wanted, tmp_path):
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_files_say_that_they_are_antialiased(suffix, tmp_path):
-    """Those that can; reading them warns, once, and only then."""
     for antialiased in (True, False):
         path = tmp_path / f"{antialiased}{suffix}"
         write_gaussians(path, model(), units="file", antialiased=antialiased)
@@ -821,7 +801,6 @@ TETRAHEDRON = Mesh(
 
 
 def glb(path):
-    """Return the document and the binary chunk of a .glb file, whose lengths are checked."""
     data = path.read_bytes()
     magic, version, size, length, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON") and length % 4 == 0
@@ -909,7 +888,6 @@ def test_glb_holds_the_texture(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
-    """Numbers that are not finite, triangles of missing vertices, other suffixes; what is written states its origin."""
     path = tmp_path / f"a{suffix}"
     bad = TETRAHEDRON.vertices.copy()
     bad[1, 1] = np.nan

@@ -20,7 +20,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux boun
 
 
 def size_of(n, degree):
-    """Return the bytes of Gaussians in float32."""
     return 4 * n * (3 + 4 + 3 + 1 + 3 * SH_SIZES[degree])
 
 

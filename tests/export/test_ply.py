@@ -81,22 +81,6 @@ def test_layout_on_disk(tmp_path):
     assert read_ply(path).means.tolist() == [[1, 2, 3]] and read_ply(path).log_scales.tolist() == [[8, 9, 10]]
 
 
-def test_file_coordinates_are_restored_in_float64(tmp_path):
-    """An offset of 5e6 m: float32 numbers about an origin that the header states, and float64 Gaussians."""
-    model = make(50)
-    normalization = Normalization(np.array([5e6, -3e5, 0.25]), 0.04)
-    write_ply(tmp_path / "a.ply", model, normalization)
-    back = read_ply(tmp_path / "a.ply")
-    want = model.means.numpy().astype(np.float64) / 0.04 + normalization.offset
-    assert "comment warpgs_origin 5000000.0 -300000.0 0.0" in split(tmp_path / "a.ply")[0]
-    assert {t.dtype for t in back.tensors().values()} == {torch.float64}
-    np.testing.assert_allclose(back.means.numpy(), want, rtol=0, atol=1e-5)
-    scales = np.exp(model.log_scales.numpy().astype(np.float64)) / 0.04
-    np.testing.assert_allclose(np.exp(back.log_scales.numpy()), scales, rtol=2e-6)
-    for name in ("quats", "logit_opacities", "sh"):
-        assert torch.equal(getattr(back, name), getattr(model, name))
-
-
 @pytest.mark.parametrize("text", [False, True])
 def test_doubles_in_map_coordinates(tmp_path, text):
     """Doubles of other programs keep their digits, in both units, and in the file that they are converted to."""
@@ -182,7 +166,6 @@ def test_a_failing_disk_leaves_the_old_file(tmp_path, monkeypatch, fsync, words)
 @pytest.mark.parametrize("form", ["ascii", "binary_big_endian", "binary_little_endian"])
 @pytest.mark.parametrize("eol", [b"\n", b"\r\n"])
 def test_files_of_other_programs(tmp_path, form, eol):
-    """Text and either byte order, with a blank at the end of lines, comments in any encoding, and an element before."""
     model, path = make(5, 2), tmp_path / "a.ply"
     write_ply(path, model, Normalization())
     lines, body = split(path)

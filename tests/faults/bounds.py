@@ -66,8 +66,6 @@ def bound_process() -> None:
 
 
 def catch_timers() -> None:
-    """Have the timers of `time_limit` raise `Hang`, where the system has them."""
-
     def late(*_: object) -> None:
         raise Hang
 
@@ -161,7 +159,6 @@ class Reached:
         return self._ran
 
     def lines(self) -> set[Line]:
-        """Return the lines that ran in the last block."""
         return {(f, n) for f, n in self._seen if n in self._wanted[f]}
 
 

@@ -67,7 +67,6 @@ class _Calls:
 
 
 def path_of(descriptor: int) -> str:
-    """Return the path of an open folder."""
     if sys.platform == "darwin":
         import fcntl
 

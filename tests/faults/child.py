@@ -86,7 +86,6 @@ def saving_viewer():
 
 
 def run_one(words: list[str]) -> int:
-    """Run one command; returns its exit code."""
     if words[0] == "worker":
         with mock.patch("warpgs.pipeline.farm.farm.LocalEngine", OneProcess):
             return main(["farm", *words[1:]])
@@ -95,7 +94,6 @@ def run_one(words: list[str]) -> int:
 
 
 def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
-    """Run commands; returns the exit code of the first that fails, or 0."""
     results.render_overview, plot.render_overview = lambda *_: None, plain_overview
     study.ABLATION_ROWS = {name: study.ABLATION_ROWS[name] for name in ("full", "no events")}
     with trace.open("wb", buffering=0) as log:
@@ -124,7 +122,6 @@ def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
 
 
 def run_words(words: list[str]) -> int:
-    """Run the commands of a command line."""
     groups = [list(g) for plus, g in itertools.groupby(words[3:], lambda w: w == "+") if not plus]
     return run(Path(os.path.realpath(words[0])), int(words[1]), Path(words[2]), groups)
 

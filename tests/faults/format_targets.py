@@ -139,7 +139,6 @@ register(
 
 
 def members_of(data: bytes) -> dict[str, bytes]:
-    """Return the files of an archive by name; none where it is broken."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             return {n: archive.read(n) for n in archive.namelist()}
@@ -148,7 +147,6 @@ def members_of(data: bytes) -> dict[str, bytes]:
 
 
 def archive_of(members: dict[str, bytes], packed: bool = False) -> bytes:
-    """Return an archive with right lengths and checksums."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED) as archive:
         for n, content in members.items():
@@ -157,7 +155,6 @@ def archive_of(members: dict[str, bytes], packed: bool = False) -> bytes:
 
 
 def zip_member(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change, remove or rename a file of an archive."""
     if not (members := members_of(data)):
         return damage(data, rng)
     name, kind = sorted(members)[int(rng.integers(len(members)))], int(rng.integers(8))
@@ -231,7 +228,6 @@ register(
 
 
 def gltf_files(root: Path) -> list[Path]:
-    """Write both kinds, and one whose opacities and rotations are fractions in integers, shown by two nodes."""
     paths = [*written(".glb")(root), *written(".gltf")(root), root / "c.glb"]
     document, part = gltf._split(paths[0].read_bytes())
     body = bytes(part)
@@ -267,7 +263,6 @@ def gltf_document(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def gltf_numbers(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the numbers, in text or behind the document."""
     if data.startswith(b"glTF"):
         return number(data, rng)
     try:

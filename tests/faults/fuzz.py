@@ -84,7 +84,6 @@ class Worker:
     """One reader with its valid files."""
 
     def __init__(self, target: Target, seed: int, folder: Path, measured: bool = False):
-        """Write the valid files; ``measured`` bounds the time of an input, after `bound_process`, and traces its lines."""
         self.target, self.seed, self.folder, self.measured = target, seed, folder, measured
         self.tally = Tally(target.name)
         self.reached = bounds.Reached(parser_lines(target) if measured else {})
@@ -285,7 +284,6 @@ def shares(names: list[str], inputs: int) -> dict[str, int]:
 
 
 def table(tallies: list[Tally]) -> str:
-    """Return one row per reader."""
     rows = [f"{'reader':<26}{'inputs':>8}{'accepted':>10}{'refused':>9}{'past':>8}{'slowest':>10}{'memory':>10}{'lines':>8}"]
     for t in tallies:
         wanted, of = sum(map(len, parser_lines(all_targets()[t.name]).values())), max(t.inputs, 1)
@@ -304,7 +302,6 @@ def shallow(tally: Tally) -> str:
 
 
 def missed(tally: Tally) -> dict[str, list[int]]:
-    """Return the lines of a reader's parser that no input reached, by file name."""
     lines = parser_lines(all_targets()[tally.name])
     found = {Path(f).name: sorted(n for n in numbers if (f, n) not in tally.lines) for f, numbers in lines.items()}
     return {f: numbers for f, numbers in found.items() if numbers}

@@ -137,7 +137,6 @@ PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), 
 
 
 def gray_png(width: int, height: int, rows: bytes, interlaced: int = 0) -> bytes:
-    """Return a gray PNG of 8 bits from its rows with their filter bytes."""
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, interlaced)
     return joined([(b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")])
 
@@ -193,7 +192,6 @@ add("jpeg", JPEGS, JPEG_PARSER, (jpeg_segments, jpeg_segments))
 
 
 def header(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a number in the first bytes."""
     return number(data[:64], rng) + data[64:]
 
 

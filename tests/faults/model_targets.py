@@ -204,7 +204,6 @@ def onnx_files(root: Path) -> list[Path]:
 
 
 def onnx_field(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change, remove or repeat a field at any depth; lengths around it stay right."""
     try:
         fields = onnx._message(memoryview(data))
     except (ValueError, IndexError):
@@ -307,7 +306,6 @@ def runs(root: Path) -> list[Path]:
 
 
 def run_changed(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a record, or a checkpoint whose digest stays right."""
     changes = (json_value, json_value, text_number) if data.startswith(b"{") else CHECKPOINT_CHANGES
     return changes[int(rng.integers(len(changes)))](data, rng)
 

@@ -65,7 +65,6 @@ def remove(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def splice(data: bytes, rng: np.random.Generator) -> bytes:
-    """Copy a part to another place, over what is there or between."""
     begin, end = _cut(data, rng)
     at = int(rng.integers(len(data) + 1))
     return data[:at] + data[begin:end] + data[at + (end - begin) * int(rng.integers(2)) :]
@@ -99,14 +98,12 @@ PLAIN: tuple[Change, ...] = (flip, fill, truncate, remove, splice, append, numbe
 
 
 def damage(data: bytes, rng: np.random.Generator) -> bytes:
-    """Apply one to three plain changes."""
     for _ in range(1 + int(rng.integers(3)) // 2 * int(rng.integers(1, 3))):
         data = _pick(rng, PLAIN)(data, rng)
     return data
 
 
 def text_number(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace a number in a text, or move it by a hundred thousandth."""
     found = list(NUMBER.finditer(data))
     if not found:
         return data
@@ -118,7 +115,6 @@ def text_number(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def text_line(data: bytes, rng: np.random.Generator) -> bytes:
-    """Remove, repeat or exchange lines, or words of a line."""
     glue = _pick(rng, (b"\n", b"\n", b" "))
     parts = data.split(glue)
     a, b = int(rng.integers(len(parts))), int(rng.integers(len(parts)))
@@ -168,7 +164,6 @@ def changed_value(whole, rng: np.random.Generator):
 
 
 def json_value(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a value of a JSON text."""
     try:
         return json.dumps(changed_value(json.loads(data), rng)).encode()
     except (ValueError, RecursionError):  # no JSON; or the value was put into itself

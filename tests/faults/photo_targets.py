@@ -134,7 +134,6 @@ def heic_files(root: Path) -> list[Path]:
 
 
 def heic_copy(root: Path, path: Path) -> np.ndarray:
-    """Decode in this process, and tell an error as the process that does it otherwise."""
     try:
         copy = photographs._coded_again(path, MAX_PIXELS)
     except Exception as e:  # as its process does, for which the caller names the file

@@ -99,8 +99,6 @@ job_files = writing({"jobs.jsonl": "".join(json.dumps(line) + "\n" for line in L
 
 
 def one_line(change: Change) -> Change:
-    """Return the change of one line of a text."""
-
     def changed(data: bytes, rng: np.random.Generator) -> bytes:
         lines = data.split(b"\n")
         i = int(rng.integers(len(lines)))
@@ -228,7 +226,6 @@ def render_files(root: Path) -> list[Path]:
 
 
 def thumbnail(root: Path, path: Path) -> bytes | None:
-    """Write a job's thumbnail from a render; None where the render is no image."""
     target = root / job.THUMBNAIL
     target.unlink(missing_ok=True)
     work.write_thumbnail(root / "renders", target)

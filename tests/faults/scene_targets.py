@@ -116,13 +116,11 @@ def write_native(root: Path) -> Path:
 
 
 def write_points(root: Path) -> None:
-    """Write one whose points have no applied_transform."""
     scenes.write_transforms(root, scenes.transforms_json(ply_file_path="pc.ply"))
     (root / "pc.ply").write_bytes(PLY)
 
 
 def write_exr(root: Path) -> None:
-    """Write one whose first depth map is of a kind that is not read."""
     content = scenes.transforms_json()
     content["frames"][0] |= {"depth_file_path": "d.exr"}
     scenes.write_transforms(root, content)
@@ -159,7 +157,6 @@ end_header
 
 
 def binary_ply() -> bytes:
-    """The points of `PLY` as numbers, with coefficients of Gaussians in place of colours."""
     head = PLY[: PLY.index(b"end_header") + 11].replace(b"ascii", b"binary_little_endian")
     for name, i in ((b"red", b"0"), (b"green", b"1"), (b"blue", b"2")):
         head = head.replace(b"uchar " + name, b"float f_dc_" + i)
@@ -209,7 +206,6 @@ add("middlebury", {"a": scenes.write_middlebury}, MIDDLEBURY, TEXT)
 
 
 def xml_bomb(data: bytes, rng: np.random.Generator) -> bytes:
-    """Put entities that double, or many tags, in front of the document."""
     doubled = "".join(f"<!ENTITY e{i + 1} '&e{i};&e{i};'>" for i in range(40)).encode()
     if rng.random() < 0.5:
         return b"<!DOCTYPE d [<!ENTITY e0 'ha'>" + doubled + b"]>" + data.replace(b"<chunk", b"<a>&e40;</a><chunk")

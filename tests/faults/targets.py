@@ -49,14 +49,12 @@ TARGETS: dict[str, Target] = {}
 
 
 def register(target: Target) -> Target:
-    """Add a reader; a module that does so is imported by `all_targets`."""
     assert target.name not in TARGETS
     TARGETS[target.name] = target
     return target
 
 
 def all_targets() -> dict[str, Target]:
-    """Return every registered reader by name."""
     for name in MODULES:
         importlib.import_module(f"tests.faults.{name}")
     return TARGETS
@@ -104,5 +102,4 @@ def writing(files: dict[str, bytes]) -> Callable[[Path], list[Path]]:
 
 
 def not_finite(**arrays: np.ndarray | None) -> str:
-    """Return the names of arrays that hold a NaN or an infinity."""
     return ", ".join(f"{n} not finite" for n, a in arrays.items() if a is not None and not np.isfinite(a).all())

@@ -30,7 +30,6 @@ READING = ("plot", "export", "render", "mesh", "prune", "eval", "view", "resume"
 
 
 def places_of(reference: Reference, command: str) -> list[tuple[str, bool]]:
-    """Return all places below the named folder that a command writes, and whether each is a folder."""
     if command in NEW:
         return [(ROOTS[command], True)]
     files, folders = set(), set()
@@ -47,7 +46,6 @@ def places_of(reference: Reference, command: str) -> list[tuple[str, bool]]:
 
 
 def plant(work: Path, outside: Path, place: str, is_folder: bool) -> None:
-    """Put a link at a place: to a copy outside of what is there, or to what could be there."""
     at, target = work / place, outside / place.replace("/", "-")
     at.parent.mkdir(parents=True, exist_ok=True)
     if at.exists():

@@ -220,7 +220,6 @@ def test_one_of_two_gets_the_folder(reference: tiny_runs.Reference, tmp_path, on
 
 
 def check_one_run(work, seed: int) -> None:
-    """Settings, scores, checkpoint, log and PLY are of one run."""
     run = work / "run"
     assert tiny_runs.leftovers(work) == []
     tiny_runs.check_whole(work, ended=True)

@@ -261,7 +261,6 @@ def test_an_endless_loop_is_a_hang(tmp_path, monkeypatch):
 
 
 def test_the_first_check_is_told_from_later_ones_and_every_reader_gets_inputs(tmp_path):
-    """Too few inputs past it fail."""
     for data, past in ((b"", 0), (b"xx", 0), (b"ok", 1), (b"ok more", 1)):
         tally = ran(tmp_path, data)
         assert tally.past == past and not tally.failures

@@ -124,7 +124,6 @@ def save_export(s: Saved) -> None:
 
 
 def save_scores(s: Saved) -> None:
-    """In a run of its own."""
     if not s.number:
         shutil.copytree(s.run.folder, s.folder / "run")
     else:
@@ -147,7 +146,6 @@ WAYS: dict[str, Callable[[Saved], object]] = {
 
 
 def calls_of(save: Callable[[Saved], object], state: Saved) -> list[Call]:
-    """Return the calls that saving makes when none fails."""
     calls: list[Call] = []
     with numbered(state.folder, calls.append):
         save(state)
@@ -233,7 +231,6 @@ def save_check_after_fault(way: str, call: Call | None, ended: str, work: Path, 
 
 
 def assert_saved(work: Path, new: Path, what: str = "", left: bool = False) -> None:
-    """All is there, and nothing else, but for a temporary file whose removal failed."""
     now, wanted = tiny_runs.digests(work), tiny_runs.digests(new)
     if left:
         now = {p: d for p, d in now.items() if not tiny_runs.is_temporary(p)}
@@ -253,13 +250,11 @@ KIB = 1024
 
 
 def sizes(*values: int) -> tuple[int, ...]:
-    """Return all values, or the middle one."""
     return values if MANY else values[len(values) // 2 :][:1]
 
 
 @pytest.fixture
 def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
-    """A function that mounts a file system in memory with options, or mounts it anew with others, and returns its folder."""
     folder = tmp_path / "disk"
     folder.mkdir()
     if not sys.platform.startswith("linux") or shutil.which("mount") is None:
@@ -285,7 +280,6 @@ def check_refused(work: Path, before: dict[str, str], said: str) -> None:
 
 
 def check_right(reference, command: str, work: Path, before: dict[str, str]) -> None:
-    """The command's results are there."""
     assert tiny_runs.leftovers(work) == []
     tiny_runs.check_whole(work, ended=True)
     for path, digest in tiny_runs.digests(work).items():
@@ -316,7 +310,6 @@ def check_command(reference, command, work, before, capfd, make_room):
 @pytest.mark.parametrize("command", ["fit", "render", "export", "convert", "mesh", "eval", "prune"])
 @pytest.mark.parametrize("room", sizes(0, 4 * KIB, 8 * KIB, 16 * KIB, 32 * KIB, 64 * KIB, 128 * KIB, 512 * KIB, 8192 * KIB))
 def test_a_disk_that_fills(reference, disk, capfd, command, room):
-    """What was there before stays, and with more room the command comes to its end."""
     work = disk("size=64m") / "work"
     reference.before(command, work)
     before = tiny_runs.digests(work)
@@ -348,7 +341,6 @@ def test_a_disk_that_cannot_be_written(reference, disk, capfd, command):
 
 @pytest.mark.parametrize("folder", ["in a file", "file", *["mount point"] * MANY])
 def test_places_for_a_run(reference, disk, capfd, folder):
-    """A mount point is a folder like any other, and stays one; a file is none."""
     work = disk("size=4k")
     words = tiny_runs.words_of("fit", reference.scene, work)
     if folder == "mount point":

@@ -35,7 +35,6 @@ KINDS = ("pipe", "device", "socket", "folder", "unreadable", "empty")
 
 
 def package(path):
-    """Read the files of an installed package whose code is special."""
     found = importlib.machinery.ModuleSpec(export.PACKAGE, None, origin=str(path.with_name("__init__.py")))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(importlib.util, "find_spec", lambda name: found)
@@ -111,7 +110,6 @@ def test_files_that_are_named(name, tmp_path, monkeypatch):
 
 
 def parts_of(kind, root):
-    """Return the files of a scene to try: what holds its cameras, an image, and a mask."""
     scene = scenes.WRITERS[kind](root)
     files = [p for p in scene.rglob("*") if p.is_file()]
     pictures = sorted(p for p in files if p.suffix == ".png")
@@ -154,7 +152,6 @@ def test_masks_of_a_scene(what, tmp_path):
 
 
 def test_photographs(tmp_path):
-    """A photograph that is no file is none of the photographs."""
     for name in "abc":
         scenes.save(tmp_path / f"{name}.png", scenes.image(0))
     before = source_digest(tmp_path)

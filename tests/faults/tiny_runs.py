@@ -56,12 +56,10 @@ make other files."""
 
 
 def can_run(command: str) -> bool:
-    """Return whether what a command needs is installed."""
     return command not in NEEDS or importlib.util.find_spec(NEEDS[command]) is not None
 
 
 def words_of(command: str, scene: Path, work: Path) -> list[str]:
-    """Return the command line of a command that works in a folder."""
     run, cpu = str(work / "run"), ["--device", "cpu"]
     fit = [
         "fit", str(scene), "--out", run, "--split", split_spec(VIEWS), "--steps", str(STEPS), "--preset", "quick",
@@ -105,7 +103,6 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of a process that runs our commands."""
     search = os.pathsep.join([str(ROOT), *filter(None, sys.path)])  # packages, too, wherever this process found them
     return os.environ | {
         "PYTHONPATH": search, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "PYTHONUTF8": "1",
@@ -125,7 +122,6 @@ class Done:
 
 @functools.cache
 def server() -> subprocess.Popen:
-    """Start the process that forks for each command; it ends with this one."""
     words = [sys.executable, "-P", "-m", "tests.faults.child", "serve"]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     return subprocess.Popen(words, env=environment(), text=True, bufsize=1, **pipes)
@@ -149,7 +145,6 @@ def child(work: Path, *commands: list[str], kill_at: int = 0) -> Done:
 
 
 def calls_in(trace: Path) -> dict[str, list[tuple[str, str, str]]]:
-    """Read the calls that a process has noted, by command."""
     calls: dict[str, list[tuple[str, str, str]]] = {}
     for line in trace.read_text("utf-8").splitlines() if trace.is_file() else []:
         if line.startswith("command "):
@@ -162,13 +157,11 @@ def calls_in(trace: Path) -> dict[str, list[tuple[str, str, str]]]:
 
 
 def succeeded(done: Done) -> Done:
-    """Return a process that ended well."""
     assert done.code == 0, done.said
     return done
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of every file below a folder."""
     paths = sorted(p for p in folder.rglob("*") if p.is_file())
     return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in paths}
 
@@ -179,7 +172,6 @@ def is_temporary(path: str) -> bool:
 
 
 def leftovers(folder: Path) -> list[str]:
-    """Return what only an interrupted command may leave."""
     return [p for p in (p.relative_to(folder).as_posix() for p in folder.rglob("*")) if is_temporary(p)]
 
 
@@ -227,7 +219,6 @@ class Reference:
 
 
 def write_photographs(folder: Path) -> None:
-    """Write four photographs that overlap, large enough for poses to be found."""
     folder.mkdir()
     shapes = still_life(0)
     for i, c in enumerate(camera_path(8, 240, 180)[1:5]):

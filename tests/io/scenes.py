@@ -21,7 +21,6 @@ TRACKS = ((0, 1, 2), (1, 4), (3,))
 
 
 def viewmat(i: int) -> np.ndarray:
-    """Return camera_from_world with OpenCV axes, on an arc around the origin, looking at it with a small roll."""
     angle = -0.6 + 0.3 * i
     center = np.array([3 * np.sin(angle), -0.4 + 0.1 * i, -3 * np.cos(angle)])
     z = -center / np.linalg.norm(center)
@@ -37,7 +36,6 @@ VIEWMATS = np.array([viewmat(i) for i in range(VIEWS)])
 
 
 def pixel(i: int, point: np.ndarray = POINT) -> np.ndarray:
-    """Return the position of a point in view i [px], pixel centres at +0.5."""
     x = VIEWMATS[i, :3, :3] @ point + VIEWMATS[i, :3, 3]
     return (K @ (x / x[2]))[:2]
 
@@ -50,7 +48,6 @@ def image(i: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
 
 
 def save(path: Path, rgb: np.ndarray, *options) -> None:
-    """Write an image of 1, 3 or 4 channels in RGB order."""
     path.parent.mkdir(parents=True, exist_ok=True)
     order = {2: slice(None), 3: [2, 1, 0], 4: [2, 1, 0, 3]}
     data = rgb if rgb.ndim == 2 else np.ascontiguousarray(rgb[..., order[rgb.shape[2] if rgb.shape[2] > 2 else 2]])
@@ -65,7 +62,6 @@ def save_images(folder: Path, names=NAMES, width: int = WIDTH, height: int = HEI
 
 
 def quaternion(R: np.ndarray) -> np.ndarray:
-    """Return the quaternion wxyz of a rotation whose trace is above -1."""
     w = np.sqrt(max(1 + np.trace(R), 1e-12)) / 2
     return np.array([w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
 
@@ -84,7 +80,6 @@ PINHOLE = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 
 
 def colmap_bin(model="PINHOLE", parameters=PINHOLE, names=NAMES, size=(WIDTH, HEIGHT)) -> dict[str, bytes]:
-    """Return the three binary files; the first image has two observations, so that records differ in length."""
     cameras = struct.pack("<QiiQQ", 1, 1, MODELS.index(model), *size) + struct.pack(f"<{len(parameters)}d", *parameters)
     images = struct.pack("<Q", len(names))
     for i, name in enumerate(names):
@@ -99,7 +94,6 @@ def colmap_bin(model="PINHOLE", parameters=PINHOLE, names=NAMES, size=(WIDTH, HE
 
 
 def colmap_txt(model="PINHOLE", parameters=PINHOLE, names=NAMES, size=(WIDTH, HEIGHT)) -> dict[str, bytes]:
-    """Return the three text files."""
     cameras = f"# Camera list\n1 {model} {size[0]} {size[1]} {' '.join(map(repr, map(float, parameters)))}\n"
     images = "# Image list\n"
     for i, name in enumerate(names):
@@ -131,7 +125,6 @@ def write_colmap_txt(root: Path, **options) -> Path:
 
 
 def opengl(i: int) -> list[list[float]]:
-    """Return camera to world with OpenGL axes."""
     return (np.linalg.inv(VIEWMATS[i]) @ np.diag([1.0, -1, -1, 1])).tolist()
 
 
@@ -148,7 +141,6 @@ def write_transforms(root: Path, content: dict | None = None, names=NAMES) -> Pa
 
 
 def write_ngp(root: Path) -> Path:
-    """Write instant-ngp's variant: field of view instead of focal lengths, no size."""
     angle = 2 * np.arctan(WIDTH / 2 / FOCAL)
     return write_transforms(root, transforms_json(w=None, h=None, fl_x=None, fl_y=None, cx=None, cy=None, camera_angle_x=angle))
 
@@ -253,7 +245,6 @@ def metashape_xml(terms: str = "", camera: str = "", kind: str = "frame", labels
 
 
 def points_ply(points: np.ndarray = POINTS) -> bytes:
-    """Return points of the same colour as text."""
     head = "ply\nformat ascii 1.0\nelement vertex {}\n" + "".join(f"property float {c}\n" for c in "xyz")
     head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
     return (head.format(len(points)) + "".join(f"{spaced(p)} 255 0 51\n" for p in points)).encode()
@@ -306,7 +297,6 @@ WRITERS = {
 
 
 def link(path: Path, target: Path) -> None:
-    """Make a link, or skip where the system or the user may not."""
     try:
         path.symlink_to(target, target_is_directory=target.is_dir())
     except OSError:
@@ -314,6 +304,5 @@ def link(path: Path, target: Path) -> None:
 
 
 def refused(root: Path, message: str, **options) -> None:
-    """Assert that the scene ends in a DataError whose text matches."""
     with pytest.raises(DataError, match=message):
         load_scene(root, **options)

@@ -105,7 +105,6 @@ def test_transforms_per_frame_intrinsics_and_mask_path(tmp_path):
 
 @pytest.mark.parametrize("other", ["{stem}.png", "{stem}.jpg", "image{i:03d}.png"])
 def test_ready_made_small_images_are_taken(other, tmp_path):
-    """Of the same names, or matched by stem or by order."""
     scenes.write_colmap(tmp_path)
     names = [other.format(stem=n[:-4], i=i) for i, n in enumerate(scenes.NAMES)]
     scenes.save_images(tmp_path / "images_2", names, 8, 6)
@@ -123,7 +122,6 @@ def test_ready_made_small_images_are_taken(other, tmp_path):
 
 
 def test_llff_with_only_small_images(tmp_path):
-    """They are taken, and resampled further where that leaves enough."""
     scenes.write_llff(tmp_path)
     (tmp_path / "images").rename(tmp_path / "gone")
     scenes.save_images(tmp_path / "images_2", width=8, height=6)
@@ -161,7 +159,6 @@ def test_windows_line_ends_and_byte_order_mark(kind, tmp_path):
 
 
 def test_other_files_of_a_reconstruction(tmp_path):
-    """Rigs and frames are not read; images without a pose are counted."""
     scenes.write_colmap(tmp_path)
     for name in ("rigs.bin", "frames.bin"):
         (tmp_path / "sparse" / "0" / name).write_bytes(b"\xff" * 9)
@@ -250,7 +247,6 @@ NAMED = {
 
 @pytest.mark.parametrize("kind", NAMED)
 def test_names_are_matched_to_the_only_file_that_fits(kind, tmp_path):
-    """And to none where two files fit, or two names one file: these photographs are skipped."""
     written, stored, shown = NAMED[kind]
     scenes.write_files(tmp_path / "sparse" / "0", scenes.colmap_bin(names=[written.format(i) for i in range(5)]))
     scenes.save_images(tmp_path / "images", [stored.format(i) for i in range(5)])
@@ -285,7 +281,6 @@ FRAMES = {
 
 @pytest.mark.parametrize("kind", FRAMES)
 def test_names_of_frames_are_matched_to_the_only_file_that_fits(kind, tmp_path):
-    """And to none where two files fit, or two names one file; a file of exactly this name comes first."""
     plain = load_scene(scenes.write_transforms(tmp_path))
     stems = [PurePosixPath(name).stem for name in scenes.NAMES]
     content = scenes.transforms_json()
@@ -367,7 +362,6 @@ CLOUD = np.random.default_rng(0).uniform(-0.8, 0.8, (60, 3))
 
 
 def cloud_colors() -> np.ndarray:
-    """Return the mean colours, 0 to 255, of the images where the points of CLOUD are."""
     seen = [np.floor([scenes.pixel(i, p) for p in CLOUD]).astype(int).clip(0, (15, 11)) for i in range(5)]
     return np.round(np.mean([scenes.image(i)[at[:, 1], at[:, 0]] for i, at in enumerate(seen)], axis=0))
 
@@ -612,7 +606,6 @@ def test_errors_name_the_way_to_keep_a_lens(lenses, values, message, tmp_path):
 
 
 def ring(i):
-    """Return an image [36, 48, 3] of a bright ring on black, with noise in the black and a dark pixel in the bright."""
     image = np.full((36, 48, 3), 5, np.uint8)
     image[6:30, 12:36] = 200 - 10 * i
     image[12:24, 18:30] = 0
@@ -734,7 +727,6 @@ def realityscan_pixels(points, px, py, k1, k2, k3, t1, t2):
 
 
 def projected(root):
-    """Return the pixels of the points in the first view of a scene with native lenses, and the scene."""
     scene = load_scene(root, lenses="native")
     n = scene.normalization
     return project_points(scene.views[0].camera, n.scale * (scenes.POINTS - n.offset))[0], scene
@@ -794,7 +786,6 @@ def test_lenses_of_realityscan(tall, tmp_path):
 
 
 def test_points_in_other_coordinates_and_missing_photographs_of_capture_programs(tmp_path):
-    """Points that no view sees are left out; of several files of cameras, the first is taken."""
     scenes.write_metashape(tmp_path)
     (tmp_path / "z.xml").write_text(scenes.metashape_xml())
     (tmp_path / "a.xml").write_text("<other/>")
@@ -824,7 +815,6 @@ def test_labels_of_metashape_have_neither_suffix_nor_folder(folder, tmp_path):
 
 
 def test_columns_of_realityscan_may_be_named_without_a_mark(tmp_path):
-    """The first line names the columns, with # or without."""
     scenes.write_realityscan(tmp_path)
     (tmp_path / "calib.csv").write_text(scenes.realityscan_csv().replace("#name", "name").partition("\r\n")[2])
     assert len(load_scene(tmp_path).views) == 5

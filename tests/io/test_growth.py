@@ -47,7 +47,6 @@ def work(run):
 
 
 def grows(make, most=13.0):
-    """Check that the work for `LARGE` is about ten times that for `SMALL`, once everything is imported."""
     make(2)()
     small, large = (work(make(n)) for n in (SMALL, LARGE))
     assert large < most * small, f"{small} steps for {SMALL}, {large} for {LARGE}"

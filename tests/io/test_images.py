@@ -34,7 +34,6 @@ def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):
 
 
 def smooth(x, y):
-    """Return an analytic image over pixel coordinates (centres at +0.5), three channels in [0, 1]."""
     return np.stack([0.5 + 0.4 * np.sin(x / 9), 0.5 + 0.4 * np.cos(y / 7), 0.5 + 0.3 * np.sin((x + y) / 11)], axis=-1)
 
 
@@ -60,7 +59,6 @@ def test_every_kind_of_png_is_decoded(mode, tmp_path):
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "BMP", "TIFF", "WEBP", "AVIF"])
 def test_truncated_images_are_named(kind, tmp_path):
-    """As are missing ones and those that are not finite."""
     path, data = tmp_path / f"a.{kind.lower()}", encoded(kind)
     for kept in (0.0, 0.02, 0.5, 0.9, 0.999):
         path.write_bytes(data[: int(kept * len(data))])
@@ -234,7 +232,6 @@ def test_masks_that_are_not_read_are_a_note(write, folder, tmp_path):
 
 
 def test_a_mask_with_the_suffix_of_its_photograph_is_of_no_other(tmp_path):
-    """Whether or not its own photograph has a mask that comes first; without that photograph, it is that of the other."""
     scenes.write_colmap(tmp_path, names=("a.png", "a.jpg", "b.png", "b.JPG", "c.png"))
     for name, gray in (("a.jpg.png", 0), ("a.png", 255), ("B.jpg_mask.png", 0), ("c.jpg.png", 0)):
         scenes.save(tmp_path / "masks" / name, np.tile(np.array([gray, 255], np.uint8).repeat(8), (12, 1)))
@@ -271,7 +268,6 @@ def test_masked_pixels_do_not_run_into_others(focal, distortion, downscale, alph
 
 
 def rgba(i, alpha):
-    """Return the test image [12, 16, 4] with an alpha channel [12, 16]."""
     return np.concatenate([scenes.image(i), alpha[..., None]], axis=2)
 
 
@@ -361,7 +357,6 @@ def test_masks_that_cannot_be_used(tmp_path):
 
 
 def photo(width=96, height=64) -> Image.Image:
-    """Return a smooth image with some noise, as a photograph has it."""
     rng = np.random.default_rng(0)
     values = scenes.image(3, width, height).astype(float) + rng.normal(0, 6, (height, width, 3))
     return Image.fromarray(np.clip(values, 0, 255).astype(np.uint8))
@@ -374,7 +369,6 @@ def encoded(kind: str, image: Image.Image | None = None, **options) -> bytes:
 
 
 def zeroed(data: bytes, start: float, end: float) -> bytes:
-    """Return the data with a part of it, in fractions of its length, set to zero."""
     a, b = int(start * len(data)), int(end * len(data))
     return data[:a] + bytes(b - a) + data[b:]
 
@@ -492,7 +486,6 @@ def test_files_that_lack_a_part_or_have_a_wrong_bit_or_checksum(tmp_path):
 
 
 def announcing(kind: str, width: int, height: int) -> bytes:
-    """Return a small file whose header announces an image of another size."""
     if kind == "PNG":
         return gray_png(width, height, bytes(100))
     if kind == "TIFF":

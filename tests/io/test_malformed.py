@@ -195,7 +195,6 @@ def test_images_without_a_finite_pose_or_camera_are_left_out(number, what, kind,
 
 @pytest.mark.parametrize("kind", ["txt", "bin", "ply"])
 def test_points_that_are_not_finite_are_left_out(kind, tmp_path):
-    """With the others of the same track; strict refuses them."""
     folder = (scenes.write_colmap_txt if kind == "txt" else scenes.write_colmap)(tmp_path)
     path = folder / ("sparse" if kind == "txt" else "sparse/0") / f"points3D.{kind}"
     if kind == "txt":
@@ -514,7 +513,6 @@ def test_realityscan_files(old, new, message, tmp_path):
 
 
 def test_large_and_unreadable_files_of_cameras(tmp_path, monkeypatch):
-    """A bound holds for their bytes; files that cannot be opened, and those without photographs, are no cameras."""
     for write, name in ((scenes.write_metashape, "cameras.xml"), (scenes.write_realityscan, "calib.csv")):
         root = write(tmp_path / name)
         with monkeypatch.context() as patch:

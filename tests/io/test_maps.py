@@ -56,7 +56,6 @@ def test_depths_of_every_format_are_in_scene_units(kind, tmp_path):
 
 
 def test_missing_views_units_and_kinds(tmp_path):
-    """Views without a map have none; --depth-unit counts for all numbers; relative maps keep theirs; NaN is no depth."""
     scene = scenes.write_colmap(tmp_path / "scene")
     write_maps(tmp_path / "maps", RAMP.astype(np.float32), scenes.NAMES[:2], ".npy")
     maps = tmp_path / "maps"
@@ -173,7 +172,6 @@ def test_a_bad_map_is_refused_with_view_and_reason(case, tmp_path):
 
 
 def test_folders_without_maps(tmp_path):
-    """A missing folder, an empty one, other formats, other names, two files for one image, and objects that numpy pickles."""
     scene, maps = scenes.write_colmap(tmp_path / "scene"), tmp_path / "maps"
     refused(scene, "no such folder", depths=maps)
     maps.mkdir()
@@ -207,7 +205,6 @@ def test_sizes_beyond_the_limit_and_links_are_refused(tmp_path):
 
 
 def write_named(root, unit=None):
-    """Write a transforms scene that names maps, as nerfstudio does."""
     content = scenes.transforms_json()
     if unit is not None:
         content["depth_unit_scale_factor"] = unit
@@ -308,7 +305,6 @@ RECT = tuple(f"rect_{i + 1:03d}_3_r5000.png" for i in range(scenes.VIEWS))
 
 
 def mask_of(i: int) -> np.ndarray:
-    """Return a mask that names its id: row i is black."""
     mask = np.full((scenes.HEIGHT, scenes.WIDTH), 255, np.uint8)
     mask[i] = 0
     return mask
@@ -320,7 +316,6 @@ def write_masks(folder, ids=range(scenes.VIEWS), form="{:03d}.png"):
 
 
 def black_rows(scene):
-    """Return the row that each view's score mask leaves out."""
     return [np.flatnonzero(~v.score_mask.any(1)).tolist() for v in scene.views]
 
 

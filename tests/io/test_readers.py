@@ -72,7 +72,6 @@ def test_a_reader_of_ones_own_is_given_as_class_object_or_name(own, folder):
 
 
 def test_a_reader_that_does_not_find_its_format_is_refused(tmp_path):
-    """Where a folder holds several formats, the one that is named is read."""
     scenes.write_transforms(scenes.write_llff(tmp_path))
     assert load_scene(tmp_path).format == "transforms" and load_scene(tmp_path, reader="llff").format == "llff"
     (tmp_path / "transforms.json").unlink()
@@ -133,7 +132,6 @@ def test_the_example_reads_back_what_it_writes(tmp_path, monkeypatch, capsys):
 
 
 def moved_out(scene, path):
-    """Move a file or folder of a scene out of it and leave a link there."""
     outside = scene.parent / "elsewhere"
     outside.mkdir(exist_ok=True)
     path.rename(outside / path.name)
@@ -174,7 +172,6 @@ def test_files_of_cameras_and_points_that_are_links(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_folders_of_images_and_masks_that_are_links(kind, tmp_path):
-    """And a mask alone."""
     for whole in (False, True):
         scene = scenes.WRITERS[kind](tmp_path / f"{whole}" / "scene")
         mask = scene / "masks" / ("000000.png" if kind == "dtu" else "photo0.png")

@@ -36,7 +36,6 @@ def right() -> Scene:
 
 
 def changed(place: str, **fields) -> Scene:
-    """Return the scene with other fields of the view b.png, of its camera or depth, of the points, or of the scene."""
     scene, replace = right(), dataclasses.replace
     if place == "scene":
         return replace(scene, **fields)
@@ -241,7 +240,6 @@ DOUBTS = {
 
 
 def doubtful(case: str, root) -> Scene:
-    """Write a scene that is possible but most likely wrong; return it."""
     values = scenes.transforms_json()
     if case == "lens":
         values |= {"k1": -9.0, "k2": 0.0}

@@ -47,7 +47,6 @@ EVEN = [
 
 @pytest.mark.parametrize("spec,views,train", EVEN)
 def test_every_8th_is_held_out_and_the_others_are_evenly_spaced(spec, views, train):
-    """Whatever the order of the views."""
     scene = numbered(views)
     split = split_views(scene, spec)
     assert ids(split.train) == train and ids(split.test) == list(range(0, views, 8))

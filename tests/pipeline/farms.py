@@ -15,14 +15,12 @@ CONFIG = FitConfig(steps=6, checkpoint_every=2, init=InitConfig(source="random",
 
 
 def write_scenes(folder: Path, count: int = 2) -> Path:
-    """Write scenes with a seed each into a folder."""
     for i in range(count):
         write_demo(folder / f"s{i}", views=8, width=48, height=36, seed=i)
     return folder
 
 
 def jobs_of(scenes: Path, out: Path, **settings) -> list[FarmJob]:
-    """A job for each scene of a folder."""
     config = dataclasses.replace(CONFIG, **settings)
     return [
         FarmJob(p.name, FitRequest(SceneRequest(str(p), split_spec(8)), out / p.name / "run", config, "cpu"), out / p.name, out)
@@ -36,11 +34,9 @@ class HereEngine:
     name = "here"
 
     def __init__(self, work=run_job, slots: int = 1):
-        """Run jobs by a function of their text."""
         self.work, self.slots, self.started, self.begun = work, slots, [], []
 
     def start(self, job: FarmJob) -> None:
-        """Note a job."""
         self.started.append(job)
         self.begun.append(job.name)
 

@@ -37,7 +37,6 @@ from warpgs.ranks import is_loopback, listeners
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """A folder with two scenes."""
     return write_scenes(tmp_path_factory.mktemp("data") / "scenes")
 
 
@@ -53,7 +52,6 @@ def single(scenes, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def done(scenes, tmp_path_factory):
-    """Results of a farm in this process."""
     out = tmp_path_factory.mktemp("done") / "results"
     run_farm(jobs_of(scenes, out), HereEngine())
     return out
@@ -76,7 +74,6 @@ def unfitted(monkeypatch):
 
 @pytest.fixture
 def results(done, tmp_path):
-    """A copy of them."""
     return shutil.copytree(done, tmp_path / "results", dirs_exist_ok=True)
 
 
@@ -105,7 +102,6 @@ class Blocks(LossTerm):
 
 
 def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_replaced(scenes, single, tmp_path, monkeypatch):
-    """The process of the first job is killed in the middle of its fit; code of the user's own is loaded there, too."""
     monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
     (tmp_path / "term.py").write_text(TERM)
     os.mkfifo(tmp_path / "pipe")
@@ -268,7 +264,6 @@ def test_a_job_as_text_is_the_same_job(scenes, tmp_path, monkeypatch):
 
 
 def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, capsys, monkeypatch):
-    """Settings of all and of one; a failure by its message; exit code 4, and 0 once nothing fails."""
     monkeypatch.setattr("warpgs.pipeline.farm.farm.LocalEngine", lambda slots: HereEngine())
     jobs = tmp_path / "jobs.jsonl"
     lines = [{"scene": str(scenes / "s0"), "name": "a", "seed": 3}, {"scene": "gone", "name": "b & c"}]
@@ -350,7 +345,6 @@ def _die_once(mark):
 
 
 def test_folders_globs_and_lines_of_flags(tmp_path, monkeypatch):
-    """Folders are scenes, hidden ones are not; lines are flags, with paths from the file; links without end are not listed."""
     for name in ("b/scene", "a/scene", ".hidden"):
         (tmp_path / name).mkdir(parents=True)
     assert [j[:2] for j in record.list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
@@ -420,7 +414,6 @@ class Cluster:
         return 0, "\n".join(self.queue), ""
 
     def end(self, number, answer=None, log=""):
-        """End a job, with an answer or without."""
         self.queue.remove(number)
         self.logs[number].write_text(log)
         if answer is not None:
@@ -429,7 +422,6 @@ class Cluster:
 
 @pytest.fixture
 def cluster(monkeypatch, tmp_path):
-    """A cluster, and an engine's cache in this test's folder."""
     found = Cluster()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(slurm, "_call", found.call)
@@ -479,7 +471,6 @@ def test_pickles_planted_in_the_results_are_never_loaded(cluster, job, tmp_path)
 
 @with_slurm
 def test_a_job_goes_to_its_node_as_json_in_a_private_folder(cluster, job, tmp_path):
-    """Nobody else can enter it; its name is random; it is removed in the end; nothing is imported from the current folder."""
     engine = SlurmEngine("cuda", None, 3, 90, "gpu")
     assert engine.slots == 100
     engine.start(job)
@@ -558,7 +549,6 @@ def test_each_end_of_a_job_is_an_event_and_what_slurm_refuses_is_said(cluster, j
 
 @with_slurm
 def test_the_process_of_a_job_answers_with_its_state_and_calls_without_a_shell(tmp_path, monkeypatch, capsys):
-    """Nothing where it is interrupted; a reason on stderr where the job cannot begin."""
     (tmp_path / "job").write_text("TEXT")
 
     for error, code in ((None, 0), (KeyboardInterrupt(), 130), (UsageError("the loss term is not there"), 1)):
@@ -586,7 +576,6 @@ def test_the_process_of_a_job_answers_with_its_state_and_calls_without_a_shell(t
 
 @pytest.fixture
 def started(monkeypatch):
-    """What Ray is started with, by a stand-in for it."""
     found = {}
     fake = SimpleNamespace(
         is_initialized=lambda: False, init=lambda **options: found.update(options), cluster_resources=lambda: {"CPU": 4},

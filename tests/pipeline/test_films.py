@@ -87,7 +87,6 @@ def test_keyframes_that_are_none_are_refused(model, tmp_path, change, words):
 
 
 def test_what_was_chosen_is_said(model, monkeypatch):
-    """Auto takes what suits the cameras, and may name a calmer path; durations and frames are those asked for."""
     plan = plan_film(model, "auto", FilmSettings(frames=4))
     assert len(plan.cameras) == 4 and plan.notes[1:] == ["path: spiral"]
     assert plan.notes[0].startswith("5 cameras on one side of the scene, over 6")
@@ -228,7 +227,6 @@ def one_way(count: int = 6) -> list[Camera]:
 
 
 def room(count: int = 10) -> list[Camera]:
-    """Cameras that stand in a small circle and look outwards."""
     inner = around(360 * np.arange(count) / count, 0.0, 0.3)
     return [Camera(look_at(c.center, 2 * c.center - TARGET, UP), K, 40, 30) for c in inner]
 
@@ -303,7 +301,6 @@ def test_close_ups_do_not_cut_the_subject_off(model, monkeypatch, azimuths):
 
 
 def test_a_film_has_the_shape_of_most_photographs():
-    """One wide photograph among upright ones, first by name, does not make the film wide."""
     cameras = around(np.arange(0, 60, 12))
     tall = [dataclasses.replace(c, width=30, height=40, K=c.K[[1, 0, 2]][:, [1, 0, 2]]) for c in cameras[1:]]
     mixed = [cameras[0], *tall]
@@ -421,7 +418,6 @@ def test_rooms_close_photographs_rings_and_closed_splines():
     ids=["ring", "arc", "walk"],
 )
 def test_a_tour_passes_through_the_cameras(cameras, closed):
-    """At a keyframe's time the path is that camera, and from frame to frame it neither jumps nor jerks."""
     rig = paths.rig_of(cameras, 2.0)
     keys, is_closed, by_name = paths.tour_of(cameras, [rig.reach(c) for c in cameras], 4.0, 100)
     assert {id(k.camera) for k in keys} == {id(c) for c in cameras} and is_closed is closed

@@ -51,7 +51,6 @@ FLAGS = ["--preset", "3dgs", "--steps", str(STEPS), "--init.source", "random", "
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene, and a run of the command on it."""
     folder = tmp_path_factory.mktemp("fit")
     write_demo(folder / "scene", views=8, width=40, height=32)
     assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), "--device", "cpu", *FLAGS]) == 0
@@ -78,7 +77,6 @@ def test_a_short_fit_reports_no_moving_objects(folder, monkeypatch, long):
 
 
 def test_command_and_function_are_one_fit(folder, fitted):
-    """Same Gaussians to the bit, same scores; the step reports are those of the log."""
     result, steps = fitted
     run = warpgs.open_run(folder / "run", "cpu")
     for name, t in run.gaussians().tensors().items():
@@ -226,7 +224,6 @@ def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkey
 
 
 def test_units_lead_from_the_fit_to_its_files_and_back(folder, fitted, tmp_path):
-    """In file units the Gaussians are those of the PLY; a camera in either units gives the same render, that of its view."""
     result, _ = fitted
     ply = folder / "run" / "point_cloud.ply"
     torch.testing.assert_close(result.gaussians("file").means, warpgs.read_ply(ply).means, rtol=0, atol=0)
@@ -249,7 +246,6 @@ def test_units_lead_from_the_fit_to_its_files_and_back(folder, fitted, tmp_path)
 
 
 def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_path, capsys):
-    """Its folder exports and renders; scoring it again needs the scene, which is said; it is continued with the scene."""
     scene = warpgs.load_scene(folder / "scene")
     few = dataclasses.replace(CONFIG, steps=3)
     result = warpgs.fit(scene, few, out=tmp_path / "run", device="cpu", verbose=False)
@@ -266,7 +262,6 @@ def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_
 
 
 def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
-    """All five degrees learn; the run, the model file, PLY and SPZ hold them, glTF holds degree 3, and the output says so."""
     config, out = dataclasses.replace(CONFIG, sh_degree=4, sh_every=2), tmp_path / "run"
     scene = warpgs.load_scene(folder / "scene")
     result = warpgs.fit(scene, config, split=SPLIT, device="cpu", out=out, verbose=False)
@@ -298,7 +293,6 @@ def write_depths(folder, factor=1.0):
 
 @pytest.fixture(scope="module")
 def given_folder(tmp_path_factory):
-    """A scene, its maps and a run with them."""
     folder = tmp_path_factory.mktemp("given")
     demo.write_demo(folder / "scene", views=VIEWS, width=SIZE[0], height=SIZE[1])
     write_depths(folder / "depths")
@@ -312,7 +306,6 @@ def command(folder, out, *more, steps=GIVEN_STEPS):
 
 
 def test_a_run_finds_a_scene_that_was_moved(given_folder, tmp_path, capsys):
-    """With the maps in it: the commands name what stores its new place, for which no other flag is needed."""
     shutil.copytree(given_folder / "scene", tmp_path / "scene")
     shutil.copytree(given_folder / "depths", tmp_path / "scene" / "maps")
     run, new, score = tmp_path / "run", tmp_path / "new place", ["eval", str(tmp_path / "run"), "--device", "cpu"]
@@ -360,7 +353,6 @@ def test_maps_decide_whether_a_run_continues_and_a_wrong_unit_is_named(given_fol
 
 
 def test_a_run_says_and_keeps_what_was_given(given_folder, capsys):
-    """Notes before the first step and after the last, figures of each view, and the settings by which the scene is read."""
     record, metrics = (json.loads((given_folder / "run" / f).read_text()) for f in ("config.json", "metrics.json"))
     notes = html.unescape((given_folder / "run" / "report.html").read_text())
     assert "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
@@ -380,7 +372,6 @@ def test_a_run_says_and_keeps_what_was_given(given_folder, capsys):
 
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
-    """Nothing goes to the user's cache."""
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
 
 
@@ -422,7 +413,6 @@ def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys, 
 
 @pytest.mark.usefixtures("own_cache")
 def test_mistakes_get_one_line(scene, tmp_path, capsys):
-    """2 usage, 3 data, 4 resources."""
     out, file = tmp_path / "out", tmp_path / "x.onnx"
     file.write_text("no network")
     shown = show(scene, "--out", out)
@@ -454,7 +444,6 @@ def test_colours_by_name_and_by_number():
 
 
 def test_the_mean_colour_is_of_training_pixels_that_count(tmp_path):
-    """Masked pixels and held-out views have no part in it; where the preset does not ask for it the scene's colour stays."""
     scene = load_scene(scenes.write_colmap(tmp_path))
     first, second, *_ = scene.views
     mask = np.zeros((12, 16), bool)
@@ -514,7 +503,6 @@ def test_a_run_keeps_its_background(tmp_path, capsys):
 
 
 def view(alpha=None, mask=None):
-    """Return a gray view of 12 x 16 px with an opacity and a mask."""
     camera = Camera(np.eye(4), np.eye(3), 16, 12)
     return View("a.png", camera, np.full((12, 16, 3), 0.4, np.float32), mask, alpha=alpha)
 
@@ -559,7 +547,6 @@ def test_scores_of_opacity_and_straight_alpha():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A short run on a Blender scene."""
     folder = tmp_path_factory.mktemp("cut_out")
     scenes.write_blender(folder / "scene")
     flags = ["--init.source", "random", "--init.random-count", "60", "--preset", "3dgs", "--steps", "3", "--device", "cpu"]
@@ -569,7 +556,6 @@ def run(tmp_path_factory):
 
 
 def test_metrics_report_and_renders_know_the_opacity(run, tmp_path, capsys):
-    """Over the background of the fit the transparent image is the opaque one; films have the colour."""
     metrics, record = (json.loads((run / n).read_text()) for n in ("metrics.json", "config.json"))
     assert set(scores.ALPHA_VARIANTS) <= set(metrics["test"]) & set(metrics["views"][0]) & set(metrics["variants"])
     assert metrics["test"]["psnr"] == metrics["test"]["psnr_whole"] and record["transparent"] is True
@@ -608,7 +594,6 @@ def move_camera(scene, name, distance):
 
 @pytest.mark.parametrize("distance", [30.0, 1000.0, 1e6])
 def test_a_camera_far_off_does_not_set_the_scale(tmp_path, distance):
-    """The scale equals that without the camera, a note names it, and the other views train as without it."""
     write_demo(tmp_path / "a", views=8, width=64, height=48)
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     move_camera(tmp_path / "b", "007.png", distance)
@@ -656,7 +641,6 @@ def other_default(request):
 
 
 def gaussians_of(preset: str, scene: Scene, device: torch.device, **changes) -> list[torch.Tensor]:
-    """The Gaussians of a short fit."""
     result = warpgs.fit(scene, preset, steps=12, split="every:4", device=device, verbose=False, **changes)
     return list(result.gaussians().tensors().values())
 
@@ -678,7 +662,6 @@ def test_a_fit_makes_its_own_types_and_devices(other_default, device, preset, ch
 
 
 def test_the_step_of_a_time_budget_too(other_default, device):
-    """It is made of numbers of its own."""
     other_default()
     assert probe_seconds(20, 16, device) > 0
 

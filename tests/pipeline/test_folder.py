@@ -39,7 +39,6 @@ LEFT = ".warpgs-0123456789abcdef.tmp"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene and a run on it."""
     folder = tmp_path_factory.mktemp("folders")
     write_demo(folder / "scene", views=8, width=32, height=32)
     warpgs.fit(folder / "scene", CONFIG, out=folder / "run", device="cpu", verbose=False)
@@ -47,17 +46,14 @@ def folder(tmp_path_factory):
 
 
 def fit(folder, out, config=CONFIG, **options):
-    """Fit the scene on the CPU, silently."""
     return warpgs.fit(folder / "scene", config, out=out, device="cpu", verbose=False, **options)
 
 
 def contents(folder):
-    """Every file with its bytes."""
     return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_a_second_fit_into_a_folder_is_refused(folder, tmp_path, monkeypatch):
-    """It comes while the first reads its scene, before there is any file to see; the first ends as if alone."""
     choose, refused = fit_module.choose_device, []
 
     def choose_device(name):
@@ -142,7 +138,6 @@ def test_what_killed_commands_left_is_removed_and_a_fit_that_has_not_ended_is_na
 
 
 def test_folders_of_errors_and_of_killed_fits(folder, tmp_path):
-    """A folder of the user's own outlives any error; one that the fit made goes."""
     (tmp_path / "own").mkdir()
     for out in ("own", "made"):
         with pytest.raises(DataError, match="no such folder"):
@@ -165,7 +160,6 @@ def test_folders_of_errors_and_of_killed_fits(folder, tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has other limits and rights")
 def test_a_folder_that_cannot_be_made_or_read_is_the_users_matter(folder, tmp_path, capsys):
-    """A name of 300 letters, and a folder without the right to look into it."""
     words = ["fit", str(folder / "scene"), "--device", "cpu", "--out"]
     for more in ([], ["--resume"]):
         assert main([*words, str(tmp_path / ("x" * 300)), *more]) in (2, 4)
@@ -181,7 +175,6 @@ def test_a_folder_that_cannot_be_made_or_read_is_the_users_matter(folder, tmp_pa
 
 @pytest.mark.parametrize("command", ["resume", "eval", "render", "export", "prune"])
 def test_runs_of_version_0_1_0_are_refused_by_name(folder, tmp_path, capsys, command):
-    """The sentence names the file, both versions and the way out; nothing is written."""
     old = tmp_path / "old"
     old.mkdir()
     record = {"format": "colmap", "config": {"preset": "quick", "steps": 600, "half": 0.0}, "versions": {"warpgs": "0.1.0"}}
@@ -198,7 +191,6 @@ def test_runs_of_version_0_1_0_are_refused_by_name(folder, tmp_path, capsys, com
 
 
 def test_the_format_is_a_number_in_both_files(folder, tmp_path):
-    """config.json and the header of the checkpoint carry it; a checkpoint of another one is refused by its version."""
     copy = shutil.copytree(folder / "run", tmp_path / "run")
     record = json.loads((copy / "config.json").read_text())
     assert record["format"] == FORMAT == 2 and record["scene_format"] == "colmap" and open_run(copy, "cpu").step == 2
@@ -219,7 +211,6 @@ with_links = pytest.mark.skipif(os.name == "nt", reason="links need a right that
 
 
 def linked(run, name, outside):
-    """Move a part of a run elsewhere, and link to it."""
     outside.mkdir(exist_ok=True)
     (run / name).rename(outside / name)
     (run / name).symlink_to(outside / name)
@@ -288,7 +279,6 @@ def test_a_farm_s_job_writes_below_the_results_alone(tmp_path, name):
 
 @with_links
 def test_a_run_folder_that_is_replaced_in_mid_fit_is_left_alone(folder, tmp_path):
-    """The fit stops before its next write; what stands in its place keeps its own contents."""
     out, config = tmp_path / "run", dataclasses.replace(CONFIG, steps=6, checkpoint_every=2, seed=3)
 
     def replace(report):
@@ -305,7 +295,6 @@ def test_a_run_folder_that_is_replaced_in_mid_fit_is_left_alone(folder, tmp_path
 
 
 def test_plain_names_stay_as_they_are():
-    """A suffix goes, a folder becomes a part of the name, and there is nothing to note."""
     names = image_names(["000.png", "left/IMG_1.JPG", "a.b.png", "Größe 1.png"])
     assert list(names.values()) == ["000", "left_IMG_1", "a.b", "Größe 1"] and renaming_notes(names) == []
 
@@ -335,7 +324,6 @@ def test_no_two_views_share_a_name(views):
 
 
 def test_images_of_views_with_like_names_are_all_written(tmp_path):
-    """Of four held-out views whose names meet, each has its render and its depth map."""
     views, wanted = photos(5), ["a/b.png", "a_b.png", "A_B.jpg", "x" * 250 + ".png", "train.png"]
     for view, name in zip(views, wanted):
         object.__setattr__(view, "name", name)

@@ -57,7 +57,6 @@ POINTS, HIT = map(np.concatenate, zip(*map(surface, range(8))))
 
 
 def exif(*place):
-    """EXIF of a photograph that was taken at latitude, longitude and height."""
     a, b, height = map(float, place)
     a_parts, b_parts = ((float(int(v)), float(int(v % 1 * 60)), v * 60 % 1 * 60) for v in (abs(a), abs(b)))
     made = Image.Exif()
@@ -103,7 +102,6 @@ def run(made, tmp_path):
 
 
 def sh(*words):
-    """Run a command that has --device."""
     return main([*map(str, words), "--device", "cpu"])
 
 
@@ -204,7 +202,6 @@ def test_renders_films_and_exports_agree_in_new_coordinates(made, tmp_path, caps
 
 
 def vertices(path):
-    """Vertices of a mesh in PLY [N, 3]."""
     head, _, body = path.read_bytes().partition(b"end_header\n")
     return np.frombuffer(body, [("at", "<f4", 3), ("color", "u1", 3)], int(re.search(rb"vertex (\d+)", head)[1]))["at"]
 
@@ -423,7 +420,6 @@ BAD = {
 
 @pytest.mark.parametrize("kind", BAD)
 def test_picks_that_cannot_be_honoured(run, capsys, kind):
-    """One line that says why, before anything is written."""
     words, message = BAD[kind]
     if kind == "background":
         tensors, state = load_checkpoint(run)

@@ -24,7 +24,6 @@ NASTY = [None, True, -1, 0.5, 10**30, "", "x", [], {}, [[]], "a\0", math.nan]
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A scene, a run on it, and the contents of its config.json."""
     folder = tmp_path_factory.mktemp("malformed")
     write_demo(folder / "scene", views=8, width=32, height=32)
     assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *FLAGS]) == 0
@@ -33,7 +32,6 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def run(made, tmp_path):
-    """A copy of the run's config.json and checkpoint."""
     for name in ("config.json", TENSORS, "metrics.jsonl"):
         (tmp_path / name).write_bytes((made[0] / "run" / name).read_bytes())
     return tmp_path
@@ -56,7 +54,6 @@ def settings(value, path=("config",)):
 
 
 def replaced(value, path, new):
-    """A copy of a file's contents with another value at a path."""
     if not path:
         return new
     whole = copy.deepcopy(value)
@@ -68,7 +65,6 @@ def replaced(value, path, new):
 
 
 def shortened(record):
-    """A record with one view alone."""
     (name, *_) = record["train"]
     return record | {"train": [name], "test": [], "cameras": {name: record["cameras"][name]}, "versions": {"warpgs": "0.2.0"}}
 
@@ -78,7 +74,6 @@ def put_record(folder, record):
 
 
 def put_checkpoint(folder, tensors, state):
-    """Write a checkpoint with a right checksum, whatever is in it."""
     text = state if isinstance(state, str) else json.dumps(state)
     tensors = {n: t.contiguous() for n, t in tensors.items()}
     body = save(tensors, {"format": str(checkpoint.FORMAT), "version": "0.2.0", "state": text})
@@ -86,7 +81,6 @@ def put_checkpoint(folder, tensors, state):
 
 
 def test_a_path_that_is_too_long_for_any_system(made, run, capsys):
-    """No scene has it."""
     put_record(run, replaced(made[1], ("scene", "path"), "x" * 5000))
     for command in (["eval", str(run), "--device", "cpu"], ["fit", "--out", str(run), "--resume"]):
         assert main(command) == 3 and "internal error" not in capsys.readouterr().err
@@ -181,7 +175,6 @@ def test_a_stored_camera_that_cannot_be_rendered_is_refused(made, run, place, va
 
 
 def test_any_value_in_the_place_of_any_other(made, run):
-    """Whatever stands in config.json, the run is opened or refused in words."""
     refused, short = 0, shortened(made[1])
     for path in places(short):
         for value in NASTY:
@@ -242,7 +235,6 @@ def test_a_state_with_a_right_checksum(run, state, words):
     ],
 )  # fmt: skip
 def test_tensors_that_do_not_fit_together(run, tmp_path, name, change):
-    """In a checkpoint and in a model's own file."""
     tensors, state = load_checkpoint(run)
     changed = change(tensors.pop(name))
     tensors |= {} if changed is None else {name: changed}
@@ -289,7 +281,6 @@ def test_packed_coefficients_that_do_not_go_with_their_degrees(run, degrees):
     ],
 )  # fmt: skip
 def test_a_checkpoint_that_no_fit_can_go_on_from(made, run, capsys, name, change):
-    """A value of its state, or a tensor: --resume names the file, and the place in the state."""
     tensors, state = load_checkpoint(run)
     if not callable(change):
         state |= {name: change}

@@ -54,7 +54,6 @@ from warpgs.synthetic.demo import camera_path, still_life
 
 
 def test_scores_are_of_the_saved_picture():
-    """LPIPS joins the figures where it is measured."""
     view = photos(1)[0]
     m = score(view, view.image + 1e-4)
     assert m.psnr > 50 and m.ssim > 0.999 and m.ssim_skimage > 0.999

@@ -293,7 +293,6 @@ def test_up_becomes_minus_y(up):
 
 
 def test_boxes(tmp_path):
-    """Of numbers, of JSON and of files; turned ones, too; and those that are none."""
     made = cloud(200)
     plain = edit.inside(made, edit.box_of("-1,-1,3,1,1,5"))
     assert torch.equal(plain, (made.means - torch.tensor([0.0, 0, 4])).abs().amax(1) <= 1)
@@ -451,7 +450,6 @@ def test_a_budget_is_0_or_was_tried():
 
 
 def test_the_cheapest_rows():
-    """The least scores, while their changes are within the budget; one row remains."""
     scores, changes = torch.tensor([3.0, 1.0, 0.0, 2.0]), torch.tensor([0.1, 5.0, 1.0, 0.0])
     for budget, rows in ((0.5, []), (1.0, [2]), (5.9, [2]), (6.0, [1, 2, 3]), (1e9, [1, 2, 3])):
         assert edit.cheapest(scores, changes, budget).nonzero()[:, 0].tolist() == rows
@@ -497,7 +495,6 @@ def run(tmp_path_factory):
 
 
 def moved(run, folder, offset):
-    """Return a copy of a run whose scene is elsewhere on the map."""
     shutil.copytree(run, folder, ignore=shutil.ignore_patterns("report*", "*.ply"))
     record = json.loads((folder / "config.json").read_text())
     record["normalization"]["offset"] = (np.array(record["normalization"]["offset"]) + offset).tolist()
@@ -506,7 +503,6 @@ def moved(run, folder, offset):
 
 
 def loss(a, b):
-    """Return the PSNR [dB] of two images."""
     return -10 * math.log10(max(float((a - b).square().mean()), 1e-12))
 
 
@@ -550,7 +546,6 @@ def test_exports_at_map_coordinates(run, tmp_path, offset, cameras):
 
 
 def test_files_with_small_units(run, tmp_path, capsys):
-    """A scene of centimetres: our files render as the run does; others name the near plane instead of the path."""
     folder = moved(run, tmp_path / "run", np.zeros(3))
     record = json.loads((folder / "config.json").read_text())
     record["normalization"]["scale"] *= 100
@@ -576,7 +571,6 @@ def test_files_with_small_units(run, tmp_path, capsys):
 
 
 def test_prune_keeps_its_promise(run, tmp_path, capsys):
-    """Smaller by more than a little, no more than the allowed loss, the old run untouched, the new one whole and usable."""
     before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     assert main(["prune", str(run), "--keep-psnr", "0.2", "--out", str(tmp_path / "a small one"), "--device", "cpu"]) == 0
     words = capsys.readouterr().out
@@ -637,7 +631,6 @@ def test_a_clean_up_is_shown_before(run, tmp_path, capsys):
 
 
 def test_bad_input_is_named(run, tmp_path, capsys, monkeypatch):
-    """No run, an existing folder, a folder nowhere: one line each, exit codes of their kind, and nothing is left behind."""
     (tmp_path / "there").mkdir()
     cases = [
         ([str(tmp_path / "none")], 3, "no such folder"),

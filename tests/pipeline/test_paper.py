@@ -133,7 +133,6 @@ OPTIONS = RasterizeOptions(rule=Rule("uncut", alpha_cut=1e-6), background=torch.
 
 
 def wall() -> Gaussians:
-    """A gray wall through the origin, across the view axes, of many flat Gaussians."""
     y, x = torch.meshgrid(torch.linspace(-1.5, 1.5, 41), torch.linspace(-2, 2, 55), indexing="ij")
     means = torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
     count = len(means)
@@ -144,7 +143,6 @@ def wall() -> Gaussians:
 
 
 def cameras() -> list[Camera]:
-    """Two cameras side by side that face the wall."""
     K = np.array([[80.0, 0, 32.7], [0, 80, 23.6], [0, 0, 1]])
     found = []
     for x in (-0.15, 0.15):
@@ -155,7 +153,6 @@ def cameras() -> list[Camera]:
 
 
 def views(paint=lambda image, number: image) -> list[TrainingView]:
-    """Two views of the wall, with something else on their images."""
     found = []
     for number, camera in enumerate(cameras()):
         rgb = rasterize(wall(), camera, OPTIONS).rgb.clamp(0, 1).numpy()
@@ -180,7 +177,6 @@ def squared_error(gaussians: Gaussians, shown: list[TrainingView]) -> float:
 
 
 def test_gain_is_the_fall_of_the_error_of_all_views(monkeypatch):
-    """A faint Gaussian just before the wall: what it changes in both renders, up to the area of its footprint."""
     shown = views(blob)
     view, before = shown[0], squared_error(wall(), shown)
     at = torch.tensor([[24, 30], [18, 22], [30, 40], [22, 44], [28, 18]])
@@ -228,7 +224,6 @@ def test_gain_counts_where_points_are_seen_and_views_agree():
 
 @pytest.mark.parametrize("size", [(3, 5), (1, 1), (2, 9)])
 def test_tiny_images_have_a_gain_map(size):
-    """Images smaller than the footprint, of odd sides."""
     width, height = size
     camera = dataclasses.replace(ring(1)[0], width=width, height=height)
     view = TrainingView.of(View("a.png", camera, np.full((height, width, 3), 0.7, np.float32)), CPU)

@@ -48,12 +48,10 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def scene():
-    """Gaussians, and more views than there are threads and pictures at a time."""
     return initial_gaussians(seeds(), InitConfig(), 3, 1.0, CPU), photos(12)
 
 
 def full(path, data):
-    """Stand in for a write to a full disk."""
     raise ResourceError(f"{path.name}: no space left")
 
 
@@ -245,7 +243,6 @@ def fitted(config: FitConfig = CONFIG, steps: int = 0, out=None) -> Trainer:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A finished fit with its folder, and the first event."""
     out, seen, fit = tmp_path_factory.mktemp("run"), [], fitted()
     with images_kept(fit, NAMES, out):
         draw, shown, fit.strategy.shown = fit.strategy.on_event, fit.strategy.shown, None
@@ -261,22 +258,6 @@ def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 3
     head, top = round(text * CONTACT_HEAD), CONTACT_MARGIN + round(text * TITLE_SIZE) + 18
     x, y = CONTACT_MARGIN + index % 5 * (width + CONTACT_GAP), top + head + index // 5 * (head + height + CONTACT_GAP)
     return sheet[y : y + height, x : x + width]
-
-
-@pytest.mark.usefixtures("tiny")
-def test_uniform_events_show_no_scores(tmp_path):
-    """Nor a disparity, as no prior was made; the words say that nothing was scored."""
-    fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, strategy="sampling"), CPU), []
-    fit.strategy.on_event = lambda step, views: seen.append(views)
-    while not seen:
-        fit.advance()
-    drawn, view = seen[0][1], fit.views[1]
-    assert fit.disparities == [] and not drawn.scores
-    sheet = view_sheet("01.png", 8, view, None, drawn, fit.strategy)
-    one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * CONTACT_HEAD) + round(1.25 * TITLE_SIZE)
-    assert sheet.shape[0] == one_row + 2 * CONTACT_MARGIN + 18  # render, image, gate, pixels, words
-    words = sampling_report_of(fit, tmp_path)[0]
-    assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
 
 
 @pytest.mark.usefixtures("tiny")
@@ -326,7 +307,6 @@ def test_events_are_shown_as_they_were_and_figures_add_up(run):
 
 @pytest.mark.usefixtures("tiny")
 def test_story_follows_the_switches(run, tmp_path):
-    """The report names gate, draw and depth as set, and a widened gate; without events it has no such section."""
     fit, out, _ = run
     (out / "sampling" / "own.png").write_bytes(b"an image of the user's own")
     story = sampling_report_of(fit, out)
@@ -384,7 +364,6 @@ def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
 
 @pytest.mark.usefixtures("tiny")
 def test_an_error_of_ours_in_an_image_is_not_hidden(tmp_path, monkeypatch):
-    """Only what the disk does is a note."""
     monkeypatch.setattr(results, "write_bytes", lambda path, data: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         fitted(CONFIG, CONFIG.steps, tmp_path)

@@ -74,7 +74,6 @@ def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> De
 
 
 def event_of(fit: Trainer, views, step: int, fraction: float = 0.01, max_fraction: float = 0.5):
-    """A sampling event on some views that is not applied."""
     return fit.strategy.sample(step, dict(enumerate(views)), fraction, max_fraction)
 
 
@@ -191,7 +190,6 @@ def test_fine_gaussians_stand_behind_valid_pixels(monkeypatch):
 
 @pytest.mark.parametrize("length, count", [(5000, 21), (25_000, 102)])
 def test_number_of_sampling_events(length, count):
-    """The paper's schedules: 2000 + 5000 + 3000 and 2000 + 25000 + 3000 steps."""
     phases = plan_phases(PhaseConfig(2000, 3000), length + 5000)
     assert (phases.refine, phases.stable_start, len(phases.events)) == (2000, length + 2000, count)
     assert phases.events[0] == 2000 and phases.events[-1] < phases.stable_start
@@ -200,7 +198,6 @@ def test_number_of_sampling_events(length, count):
 
 
 def test_short_fit_has_all_phases():
-    """Half the steps are phase 2, however few there are."""
     phases = plan_phases(PhaseConfig(2000, 3000), 300)
     assert (phases.refine, phases.stable_start) == (60, 210) and phases.events[0] == 60 and len(phases.events) == 21
     assert plan_phases(PhaseConfig(), 100).stable_start == 100

@@ -325,7 +325,6 @@ def launched(monkeypatch):
 @pytest.mark.parametrize("recorded", [True, False])
 @pytest.mark.parametrize("strategy", ["paper", "mcmc"])
 def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch, launched):
-    """Start, steps with and without masks, density events and scores: every module and size of blocks is among the warmed."""
     views = photos(3)
     views[0] = dataclasses.replace(views[0], mask=np.ones(views[0].image.shape[:2], bool))
     monkeypatch.setattr(sampling, "MIN_ALPHA", 0.05)
@@ -366,7 +365,6 @@ def test_calls_of_other_programs_launch_nothing_else(device, launched):
 
 @pytest.mark.slow
 def test_the_second_call_finds_all_in_the_cache(tmp_path, monkeypatch, capsys):
-    """One small module in an empty cache: compiled by the first call, found by the second, which knows nothing of the first."""
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(precompile, "fit_kernels", lambda cuda: [(nothing, 1)])

@@ -158,7 +158,6 @@ def scene(demo):
 
 @pytest.fixture(scope="module")
 def finished(scene, tmp_path_factory):
-    """Two settings, two seeds, one scene."""
     request = StudyRequest((scene,), {"a": A, "b b": B}, 2, tmp_path_factory.mktemp("study") / "out", "cpu")
     return request, run_study(request)
 
@@ -168,7 +167,6 @@ def metrics_of(request, variant, seed):
 
 
 def test_every_run_is_an_ordinary_run_folder_and_tables_are_of_these_runs(finished):
-    """SCENE/VARIANT/SEED; means, deviations and paired intervals are computed once more from the run folders."""
     request, lines = finished
     for variant, steps in (("a", 8), ("b b", 16)):
         for seed in (0, 1):
@@ -252,7 +250,6 @@ def test_runs_of_another_kind_are_moved_aside_and_said(finished, tmp_path):
 
 
 def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, monkeypatch):
-    """Same settings and same name, but other code: the old run says nothing of it."""
     monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
     path = tmp_path / "mine.py"
     code = "from warpgs import Strategy\nclass Mine(Strategy):\n    rate = {}\nmine = {{'base': 'quick', 'strategy': Mine}}\n"
@@ -284,7 +281,6 @@ def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, mo
     ],
 )  # fmt: skip
 def test_what_makes_a_run_another_run(finished, tmp_path, monkeypatch, key, value, word):
-    """Each of these alone forbids to keep it."""
     fitted = lambda request: SimpleNamespace(metrics={"fitted": request.resume})  # noqa: E731
     monkeypatch.setattr("warpgs.pipeline.farm.work.fit_request", fitted)
     request = copy_of(finished, tmp_path)
@@ -341,7 +337,6 @@ def test_lpips_is_measured_on_kept_runs(finished, tmp_path):
 
 
 def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
-    """The table is of the mean over scenes, with a table per scene after it."""
     shutil.copytree(scene.path, tmp_path / "other")
     request = copy_of(finished, tmp_path, scenes=(scene, SceneRequest(str(tmp_path / "other"), scene.split)))
     shutil.copytree(request.out / "still", request.out / "other")
@@ -364,7 +359,6 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
 
 
 def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
-    """Its runs are jobs; what failed there is a failed run, and is not fitted again in this process."""
     monkeypatch.setattr("warpgs.pipeline.farm.farm.LocalEngine", lambda slots: HereEngine(slots=len(slots)))
     request = dataclasses.replace(finished[0], out=tmp_path / "out", seeds=1, engine={"slots": 2})
     run_study(request)
@@ -383,7 +377,6 @@ def fail(text):
 
 
 def test_requests_that_make_no_sense(scene, tmp_path, capsys):
-    """Found out before anything is fitted."""
     both = {"a": A, "b": B}
     for words, scenes, variants, seeds in (
         ("--seeds must be a number from 1 to 1000", (scene,), both, 0), ("at least two settings", (scene,), {"a": A}, 2),
@@ -405,7 +398,6 @@ def test_requests_that_make_no_sense(scene, tmp_path, capsys):
 
 
 def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
-    """`warpgs compare` from flags to files; one seed is said to prove nothing."""
     monkeypatch.setitem(PRESETS._made, "a", A)
     monkeypatch.setitem(PRESETS._made, "b", B)
     flags = ["--presets", "a,b", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
@@ -460,7 +452,6 @@ def test_ablation_rows_switch_one_part_each():
 
 
 def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
-    """`warpgs ablate` from flags to a table with check marks; two of its rows, for time."""
     monkeypatch.setitem(PRESETS._made, "whole", FULL)
     monkeypatch.setattr("warpgs.pipeline.study.study.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
@@ -489,7 +480,6 @@ def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize("n", [2, 5, 40])
 @pytest.mark.parametrize("confidence", [0.8, 0.95])
 def test_interval_equals_scipys_paired_t(n, confidence):
-    """Mean, deviation, both ends and the verdict on zero, for few and many pairs."""
     rng = np.random.default_rng(n)
     base = 20 + rng.standard_normal(n)
     ours = base + 0.1 + 0.1 * rng.standard_normal(n)
@@ -537,7 +527,6 @@ def test_forest_draws_every_seed_and_prints_every_interval():
 
 
 def test_crops_find_where_pictures_differ_and_a_sheet_shows_them():
-    """The largest disagreement first, none overlapping; a sheet has columns of one width, colours kept, and boxes."""
     truth = np.zeros((40, 60, 3), np.float32)
     a, b = truth.copy(), truth.copy()
     a[30:36, 44:54] = 0.9

@@ -12,14 +12,12 @@ from warpgs.pipeline.train.trainer import Trainer
 
 
 def advanced(fit: Trainer, until: int | None = None) -> Trainer:
-    """Take the steps of a fit up to ``until``, or all."""
     while fit.step < (fit.steps if until is None else until):
         fit.advance((fit.steps if until is None else until) - fit.step)
     return fit
 
 
 def same_bits(a: Trainer, b: Trainer, but: tuple[str, ...] = ()) -> bool:
-    """Whether two fits have the same state, but for some of its tensors."""
     (mine, values), (theirs, others) = a.state(), b.state()
     equal = mine.keys() == theirs.keys() and all(torch.equal(t, theirs[n]) for n, t in mine.items() if n not in but)
     return equal and (bool(but) or values == others)

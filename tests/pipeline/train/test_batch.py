@@ -98,7 +98,6 @@ def test_any_number_of_processes_gets_the_same_bits(batch):
 
 
 def test_rows_of_a_large_tensor_are_divided_and_means_are_sums_over_slots(monkeypatch):
-    """Each process has the sums of its own rows; a tensor that becomes a mean is divided by the slots, and no other."""
     random = torch.Generator().manual_seed(0)
     slots = [[torch.randn(s, generator=random) for s in ((7, 3), (501, 4), (5,))] for _ in range(6)]
     alone, sums = summed(slots, ALONE, means=2), summed(slots, ALONE)
@@ -119,7 +118,6 @@ def test_every_process_plans_the_same_memory_and_every_slot_is_in_one(batch, ran
 
 
 def test_a_process_without_a_view_is_refused():
-    """And so are fits whose renders cannot be numbered."""
     with pytest.raises(UsageError, match="give a multiple"):
         check_ranks(3, Thread(0, 4, [], threading.Barrier(1)))
     with pytest.raises(UsageError, match="renders; lower --steps or --batch"):
@@ -200,7 +198,6 @@ def test_several_steps_at_once_are_those_one_by_one():
 
 
 def test_a_loss_that_is_no_number_names_its_view_and_ends_a_series():
-    """A NaN in one photograph of three: the Gaussians are those before the step, and its views come again."""
     views = photos(3)
     bad = View("bad", views[1].camera, np.full_like(views[1].image, np.nan))
     fit = Trainer([views[0], bad, views[2]], seeds(), dataclasses.replace(PLAIN, batch=3), CPU)
@@ -243,7 +240,6 @@ def test_a_view_beyond_the_capacity_ends_a_series_which_is_taken_up_again(monkey
 
 
 def test_ranks_go_on_without_graphs_together():
-    """Large views are in the slots of one of two ranks alone: both take the same steps where these exceed the limit."""
     views = [*photos(2), *photos(2, 24, 20)]
     config = dataclasses.replace(PLAIN, batch=2, steps=6)
 
@@ -323,7 +319,6 @@ BUSY = FitConfig(
 
 
 def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple[Trainer, list]:
-    """A fit of all steps on CUDA, and its reports."""
     config = dataclasses.replace(config, cuda_graph=recorded)
     fit = Trainer(views, seeds(61), config, torch.device("cuda", 0), priors=priors(views))
     reports = []
@@ -333,12 +328,10 @@ def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple
 
 
 def four() -> list[View]:
-    """Views of one size."""
     return photos(4)
 
 
 def sizes() -> list[View]:
-    """Views of two sizes, one of them with a mask."""
     views = photos(2) + photos(2, 24, 20)
     views = [View(f"{i}", v.camera, v.image) for i, v in enumerate(views)]
     mask = np.ones(views[0].image.shape[:2], bool)
@@ -418,7 +411,6 @@ def test_too_little_capacity_is_found_and_fixed(monkeypatch, batch):
 
 @pytest.mark.cuda
 def test_loss_that_is_no_number_stops_before_it_harms():
-    """A NaN in one photograph: the Gaussians are those of the step before."""
     views = photos(4)
     bad = [*views[:3], View("bad", views[3].camera, np.full_like(views[3].image, np.nan))]
     config = dataclasses.replace(BUSY, density=DensityConfig(start=1000))

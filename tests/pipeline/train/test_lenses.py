@@ -64,7 +64,6 @@ def bent(camera: Camera, bend: tuple[float, ...] = BEND) -> Camera:
 
 
 def views(count: int = 4) -> list[View]:
-    """Views of three Gaussians; of every two cameras the second bends the other way."""
     found = []
     for i, camera in enumerate(ring(count, 40, 32)):
         c = bent(camera, tuple((-1) ** i * b for b in BEND))
@@ -74,7 +73,6 @@ def views(count: int = 4) -> list[View]:
 
 @pytest.fixture(scope="module")
 def fit() -> Trainer:
-    """A fit before its first step."""
     return Trainer(views(), seeds(), CONFIG, CPU)
 
 
@@ -149,7 +147,6 @@ def test_chunks_memory_and_half_sizes_know_the_model(fit):
 
 
 def test_what_cannot_be_rendered_is_refused_before_the_first_step():
-    """An unknown model, or one with other coefficients; the error says which."""
     first, *rest = views(2)
     for change, words in (({"model": "fish"}, "unknown camera model 'fish'"), ({"distortion": np.zeros(2)}, "takes 4")):
         wrong = dataclasses.replace(first, camera=dataclasses.replace(first.camera, **change))
@@ -213,7 +210,6 @@ def test_the_default_fit_goes_through_the_lens(lens_run):
 
 @pytest.mark.slow
 def test_depth_found_in_other_views_is_that_of_the_lens(lens_run):
-    """Where the sweep finds depth, exact points of the scene lie there in half of the pixels."""
     scene = warpgs.load_scene(lens_run.parent / "scene", lenses="native")
     config, _ = settings_by_views(FitConfig(steps=2, init=InitConfig(source="sweep")), list(scene.views), "cpu")
     depths = prepare(list(scene.views), None, config, torch.device("cpu"), [], lambda: None)[1].depths
@@ -250,7 +246,6 @@ def test_commands_know_the_lens_or_take_its_pinhole(lens_run, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_orthographic_views_are_fitted_from_points(tmp_path):
-    """With scores and a report; where a pinhole would be needed, the error says what to do."""
     views = []
     for i, c in enumerate(ring(8)):
         K = np.concatenate([c.K[:, :2] / 2.2, c.K[:, 2:]], 1)
@@ -269,7 +264,6 @@ def test_orthographic_views_are_fitted_from_points(tmp_path):
 
 
 def test_a_pinhole_in_place_of_a_lens():
-    """Pose, K and size stay; parallel rays have no pinhole."""
     camera = dataclasses.replace(ring(1)[0], model="opencv", distortion=np.ones(8))
     found = pinhole_of(camera)
     assert (found.model, found.distortion) == ("pinhole", None) and found.K is camera.K and found.viewmat is camera.viewmat
@@ -326,7 +320,6 @@ def test_a_step_renders_with_the_filter(device, captured):
 
 @pytest.mark.usefixtures("free")
 def test_scores_models_and_images_have_the_filter(filtered_run):
-    """Of the fit, of each step, of the folder, of the viewer; scores and images are of renders with it."""
     result, shown = filtered_run
     stored = warpgs.open_run(result.folder, "cpu")
     models = [result, shown[-1], stored, content_of_run(result.folder).model]
@@ -391,7 +384,6 @@ CUTOUT = FitConfig(
 
 
 def cutouts(count: int = 4) -> list[View]:
-    """Views of the three Gaussians before white, with their opacity."""
     views = []
     for i, camera in enumerate(ring(count)):
         render = rasterize(three_gaussians(), camera, RasterizeOptions(background=torch.ones(3)))

@@ -66,7 +66,6 @@ def maps(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor
 
 @pytest.mark.parametrize("shape", [(70_001,), (300, 401), (3, 40, 50, 3), (5,)])
 def test_a_total_has_the_same_bits_for_any_number_of_threads(shape):
-    """Of values per Gaussian, and of images."""
     values, threads, found = torch.rand(shape, generator=torch.Generator().manual_seed(0)), torch.get_num_threads(), []
     try:
         for n in (1, 2, 3):
@@ -136,7 +135,6 @@ def test_depth_has_a_gradient_only_where_a_term_reads_it(monkeypatch):
 @pytest.mark.usefixtures("registries_as_they_were")
 @pytest.mark.parametrize("batch", [1, 3])
 def test_a_term_sees_camera_and_step(batch):
-    """Those of each view of the step, at the size of its image; all views of a step have its number."""
     seen = []
 
     @LOSS_TERMS.register("witness")
@@ -381,8 +379,6 @@ def test_a_plane_is_smooth_and_a_bend_is_not():
 
 
 def test_fits_follow_their_terms():
-    """Normals and depth are smoother, and depth is nearer to given maps, than without the term."""
-
     def found(config: FitConfig) -> float:
         fit = advanced(Trainer(photos(4), seeds(), config, CPU))
         renders = [(v, rasterize(fit.gaussians, v.camera)) for v in fit.views]
@@ -498,7 +494,6 @@ def test_depth_term_hides_no_nan():
 
 
 def agreement(fit: Trainer, wanted: list[Prior]) -> float:
-    """Mean correlation of a fit's depths with given disparities."""
     renders = [rasterize(fit.gaussians, v.camera) for v in fit.views]
     return float(np.mean([correlation(r.depth, r.alpha, torch.as_tensor(p.disparity), None) for r, p in zip(renders, wanted)]))
 

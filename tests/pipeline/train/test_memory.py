@@ -147,7 +147,6 @@ def test_plan_covers_density_events_and_held_out_blocks():
 
 @pytest.mark.parametrize("most", [400, 3000])
 def test_plan_covers_chunks(most):
-    """The same for steps that render in chunks."""
     views = photos(2, 200, 150)
     fit = Trainer(views, seeds(800), STEADY, CPU)
     fit.advance()
@@ -196,7 +195,6 @@ class Copies(LossTerm):
 
 @pytest.mark.parametrize("declared", [True, False])
 def test_a_buffer_of_ones_own_is_planned_once_it_is_declared(monkeypatch, declared):
-    """And one that is not is found by what a step holds."""
     monkeypatch.setitem(LOSS_TERMS._classes, "copies", Copies)
     monkeypatch.setattr(Copies, "name", "copies")
     config = dataclasses.replace(STEADY, loss_terms=(Copies(declared=declared),))
@@ -306,13 +304,11 @@ def failing(monkeypatch, owner, name: str, calls: set[int]):
 
 
 def saved(fit: Trainer) -> tuple[dict, dict]:
-    """A state in memory of its own on the host, as a file has it: the device may be full."""
     tensors, plain = fit.state()
     return {n: t.to("cpu", copy=True) for n, t in tensors.items()}, copy.deepcopy(plain)
 
 
 def finished(fit: Trainer, states: list) -> list[int]:
-    """Take the remaining steps, save the state every 10 steps and after the last, and return the numbers of steps reported."""
     seen = []
 
     def on_step(report):
@@ -401,7 +397,6 @@ class OtherProgram:
         monkeypatch.setattr(torch.cuda, "mem_get_info", self.left)
 
     def left(self, device):
-        """Return free and installed bytes, as torch.cuda.mem_get_info does."""
         if not self.limit:
             return self.free(device)
         return max(0, self.limit - torch.cuda.memory_reserved(device)), self.total
@@ -426,7 +421,6 @@ class OtherProgram:
 
 @pytest.fixture
 def other(monkeypatch):
-    """Such a program, which ends with the test."""
     program = OtherProgram(monkeypatch)
     yield program
     program.give_back()
@@ -463,7 +457,6 @@ def test_a_device_without_memory_ends_the_fit_which_goes_on_later(other):
 
 @pytest.mark.cuda
 def test_2000_steps_beside_a_program_that_comes_and_goes(other):
-    """All but 8 MiB to 1 GiB is taken for half of each 100 steps; the fit goes on, or ends with class 4 and is continued."""
     density = dataclasses.replace(BUSY.density, every=25, stop_fraction=0.9)
     config = dataclasses.replace(BUSY, steps=2000, density=density, max_gaussians=30_000)
     random, states, seen, ended, said = np.random.default_rng(0), [], set(), 0, []

@@ -81,7 +81,6 @@ def test_more_time_more_steps(monkeypatch):
     ],
 )  # fmt: skip
 def test_flags_that_exclude_each_other(scene, tmp_path, capsys, flags, words):
-    """Exit code 2, one line, no folder left."""
     out = tmp_path / "run"
     assert main(["fit", str(scene), "--split", split_spec(9), "--out", str(out), "--device", "cpu", *flags]) == 2
     said = capsys.readouterr().err
@@ -124,23 +123,19 @@ CONFIG = FitConfig(
 
 
 def trainer(config: FitConfig = CONFIG, device: torch.device = CPU) -> Trainer:
-    """A fit that has not begun."""
     views = photos(4)
     return Trainer(views, seeds(61), config, device, priors=priors(views))
 
 
 def begun(config: FitConfig, steps: int | None) -> Trainer:
-    """A fit of which some steps are taken, or all."""
     return advanced(Trainer(photos(4), seeds(), config, CPU), steps)
 
 
 def finish(fit: Trainer, step: int | None = None) -> dict[str, torch.Tensor]:
-    """Take steps up to ``step``, or all; return copies of the parameters."""
     return {n: t.detach().clone() for n, t in advanced(fit, step).taker.params.items()}
 
 
 def plain(config: FitConfig) -> FitConfig:
-    """The settings without a mean."""
     return dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, average_last=0.0))
 
 
@@ -233,7 +228,6 @@ def test_a_damaged_mean_is_refused_and_the_memory_plan_counts_the_sums():
 @pytest.mark.cuda
 @pytest.mark.parametrize("parts", [(), (DepthCorrelation(0.3, 0.7),)])
 def test_graphs_give_the_same_bits(parts):
-    """Captured steps end at each sample."""
     config = dataclasses.replace(CONFIG, steps=100, loss_terms=parts)
     cuda = torch.device("cuda", 0)
     graphs, single = (finish(trainer(dataclasses.replace(config, cuda_graph=on), cuda)) for on in (True, False))
@@ -263,7 +257,6 @@ CONFIGS = {
 
 
 def slow(config: FitConfig) -> FitConfig:
-    """The settings with slower growth, and with dropout."""
     slower = dataclasses.replace(config.density, gradient=1e-3)
     return dataclasses.replace(config, dropout=0.5, stopping=StoppingConfig(0.0), density=slower)
 
@@ -408,7 +401,6 @@ def test_when_growth_may_end():
 
 @pytest.mark.usefixtures("tiny")
 def test_command_line_says_why_growth_stopped(scene, tmp_path, capsys):
-    """A whole run with early stopping and --max-gaussians: terminal, metrics.json and report."""
     flags = ["--split", split_spec(9), "--steps", "60", "--device", "cpu", "--preset", "3dgs", "--stopping.min-gain-db", "0.1"]
     assert main(["fit", str(scene), "--out", str(tmp_path / "run"), *flags, "--max-gaussians", "900"]) == 0
     words = capsys.readouterr().out

@@ -197,14 +197,12 @@ def test_objects_mappings_and_registered_names_are_presets(own, monkeypatch):
     ],
 )  # fmt: skip
 def test_a_value_out_of_range_is_refused_by_its_flag(kind, bad, said):
-    """With the range or the choices."""
     ((name, value),) = bad.items()
     with pytest.raises(UsageError, match=rf"{said.format(name.replace('_', '-'))}.*{value}"):
         kind(**bad)
 
 
 def test_keywords_replace_settings():
-    """Each setting has a keyword: flat, or a group as a mapping or dataclass; view modules are switched by their own names."""
     # as the flag, with underscores; none is an argument of the fit or an option of reading
     for config in (FitConfig(), PRESETS["mcmc"], dataclasses.replace(PRESETS["default"], loss_terms=(AlphaDifference(2.0),))):
         names = setting_names(config)
@@ -271,7 +269,6 @@ def test_a_fit_takes_keywords_and_records_where_settings_come_from(tmp_path):
 
 
 def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
-    """Flags come after the preset; a mistake is one line."""
     path = written(tmp_path, "steps = 9\nseed = 4\n")
     base = ["scene", "--out", "run"]
     request = request_of([*base, "--preset", str(path), "--steps", "3"], "")
@@ -306,7 +303,6 @@ LAST, GAIN, MEANS, SH = "optimizer.average_last", "stopping.min_gain_db", "optim
 
 
 def chosen(views: int, device: str = "cuda", view=OPAQUE, preset: str = "default", **given):
-    """The settings for a number of alike views, and the notes; settings that are given, by keyword."""
     config = with_settings(PRESETS[preset], given, "here", keywords=True)
     config, notes = settings_by_views(config, [view_stub(**view)] * views, device)
     return config, " ".join(notes)
@@ -351,7 +347,6 @@ def value(config: FitConfig, name: str):
     ],
 )  # fmt: skip
 def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):
-    """And the notes name the choices."""
     config, notes = chosen(views, device, view, **given)
     assert {name: value(config, name) for name in wanted} == wanted
     if not given:
@@ -376,7 +371,6 @@ def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):
     ],
 )
 def test_what_is_given_holds(name, given):
-    """Whatever the views and the device, in every preset that has the setting."""
     for views, device, preset in itertools.product((3, 12, 60), ("cpu", "cuda"), ("default", "quick")):
         assert value(chosen(views, device, preset=preset, **{keyword(name): given})[0], name) == given
     assert chosen(12, "cpu", stopping_min_gain_db=0.2)[0].sh_every == 500

@@ -12,7 +12,6 @@ from tests.gaussians import cloud
 from tests.pipeline.train.fits import advanced, continued, same_bits
 from tests.scenes import photos, seeds
 from warpgs.errors import UsageError
-from warpgs.geometry import quaternions, rotation_matrices
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
@@ -189,20 +188,6 @@ def test_captured_steps_equal_single_steps():
     assert all(torch.equal(t, captured[n]) for n, t in single.items())
 
 
-def test_rotations_there_and_back():
-    """Every quaternion, also a half turn about an axis, gives its rotation, and the rotation gives it back up to its sign."""
-    q = torch.nn.functional.normalize(
-        torch.randn(200, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), dim=1
-    )
-    q = torch.cat([q, torch.eye(4, dtype=torch.float64), torch.tensor([[0, 1.0, 1, 0]], dtype=torch.float64) / math.sqrt(2)])
-    r = rotation_matrices(q)
-    assert torch.allclose(r @ r.transpose(1, 2), torch.eye(3, dtype=torch.float64).expand_as(r), atol=1e-12)
-    assert torch.allclose(torch.linalg.det(r), torch.ones(len(r), dtype=torch.float64))
-    assert torch.allclose((quaternions(r) * q).sum(1).abs(), torch.ones(len(r), dtype=torch.float64), atol=1e-12)
-    turn = rotation_matrices(torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]]))[0]
-    assert torch.allclose(turn[:2, 0], torch.tensor([math.cos(0.6), math.sin(0.6)]))
-
-
 # Parts of a user's own in a fit: loss terms, and a density strategy.
 
 PLAIN = FitConfig(steps=40, sh_every=15, init=InitConfig(source="points"), sh_degree=0)
@@ -215,7 +200,6 @@ class Gray(LossTerm):
     weight: float = 20.0
 
     def __call__(self, inputs):
-        """See the class."""
         return self.weight * (inputs.outputs["rgb"] - 0.5).square().mean()
 
 
@@ -270,8 +254,6 @@ def test_a_term_without_a_gradient_is_refused_at_its_first_step(device):
 
 
 def own_update(make):
-    """A strategy that makes one update after the second step, by a function of the context."""
-
     class Own(Strategy):
         def due(self, step):
             return step == 2
@@ -284,7 +266,6 @@ def own_update(make):
 
 
 def grown(context, count, parent=0, value=None, keep=None):
-    """An update with ``count`` copies of a Gaussian."""
     rows = {n: t[:1].repeat(count, *[1] * (t.dim() - 1)) for n, t in context.gaussians.tensors().items()}
     if value is not None:
         rows["means"][-1, 0] = value
@@ -294,7 +275,6 @@ def grown(context, count, parent=0, value=None, keep=None):
 
 
 def overwriting(context, rows, value=0.0):
-    """An update that overwrites means."""
     means, keep = (
         torch.full((len(rows), 3), value, device=context.device),
         torch.arange(len(context.table), device=context.device),

@@ -328,7 +328,6 @@ CHOSEN = {name: settings_by_views(config, photos(3), "cpu")[0] for name, config 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_part_of_a_fit_is_used(preset, monkeypatch):
-    """Every step is taken, Gaussians are added by refinement, events sample where the preset has any, and a view is scored."""
     scored, config = [], CHOSEN[preset]
     score = warmups.score
     monkeypatch.setattr(warmups, "score", lambda view, image: scored.append(score(view, image)))
@@ -348,7 +347,6 @@ def test_limits_of_the_real_fit_do_not_stop_it():
 
 
 def test_only_a_free_gpu_is_warmed_up(monkeypatch):
-    """Nothing is begun on a CPU, nor where networks for priors run on the GPU."""
     monkeypatch.setattr(warmups, "warm_up", lambda *_: pytest.fail("begun"))
     networks = dataclasses.replace(PRESETS["default"].priors, onnx_provider="cuda")
     for config, device in ((PRESETS["default"], WARMUP_CPU), (dataclasses.replace(PRESETS["default"], priors=networks), CUDA)):
@@ -357,8 +355,6 @@ def test_only_a_free_gpu_is_warmed_up(monkeypatch):
 
 
 def test_what_goes_wrong_is_raised_and_nothing_goes_on_after_the_block(monkeypatch):
-    """By what waits for the end, in the thread that waits."""
-
     def fail(*_):
         raise RuntimeError("out of order")
 
@@ -416,7 +412,6 @@ def test_priors_are_made_where_an_event_reads_them(setting, needed, monkeypatch)
 
 
 def consistent(views):
-    """A depth of three units everywhere."""
     size = views[0].image.shape[:2]
     return [ViewDepth(np.full(size, 3.0, np.float32), np.ones(size, bool), np.ones(size, np.float32)) for _ in views]
 
@@ -454,7 +449,6 @@ def test_a_fit_is_the_same_after_a_background_warmup():
 
 
 def test_reports_of_steps_count_as_their_time():
-    """On the clock of a fit."""
     now, views = [0.0], photos(2)
     fit = Trainer(views, seeds(), dataclasses.replace(CHOSEN["quick"], steps=6), WARMUP_CPU, priors=priors(views))
 

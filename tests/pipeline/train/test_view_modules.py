@@ -106,7 +106,6 @@ class Zoom(warpgs.ViewModule):
 
 @pytest.fixture
 def own(tmp_path, registries_as_they_were):
-    """The file."""
     (tmp_path / "own.py").write_text(OWN)
     return str(tmp_path / "own.py")
 
@@ -138,7 +137,6 @@ def test_its_parameters_are_learned_shown_and_kept(own):
 
 
 def test_a_run_keeps_what_its_view_modules_found(own, tmp_path, capsys):
-    """In metrics and report; a run opened, scored again or pruned has the cameras that were found, without the user's code."""
     write_demo(tmp_path / "scene", views=8, width=32, height=32)
     flags = ["--preset", "3dgs", "--steps", "8", "--init.source", "random", "--init.random-count", "60", "--device", "cpu"]
     words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8)]
@@ -251,7 +249,6 @@ def dimmed(views, gains):
 
 
 def test_photographs_of_many_exposures_make_one_model(tmp_path):
-    """Held-out views, of the mean exposure, score better than without; the gains that are found are those that were made."""
     write_demo(tmp_path, views=12, width=48, height=36)
     scene = warpgs.load_scene(tmp_path)
     gains = 0.6 + 0.4 * np.array([[0.5, 0.4, 0.6], [0, 0, 0], [1, 1, 1], [0.2, 0.3, 0.1], [0.8, 0.7, 0.9], [0.5, 0.6, 0.4]])
@@ -425,7 +422,6 @@ def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits(tm
 
 
 def test_held_out_cameras_follow_the_similarity_of_the_training_cameras():
-    """Where refinement moved the world as a whole, a held-out camera sees the moved world as it saw the given one."""
     cameras = {f"{i}": c for i, c in enumerate(scenes.ring(5))}
     train = ("0", "1", "2", "4")
     generator = np.random.default_rng(1)
