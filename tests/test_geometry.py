@@ -317,3 +317,13 @@ def test_cameras_far_off_the_rest(xs, points, far):
     centers = np.stack([np.array(xs, float), np.zeros(len(xs)), np.zeros(len(xs))], 1)
     cloud = None if points is None else np.array([[0, 0, z] for z in points])
     assert np.flatnonzero(~near_cameras(centers, cloud)).tolist() == far
+
+
+def test_a_camera_that_cannot_look_there():
+    """Lists are points, too; up along the view, or a target at the center, would give NaN."""
+    assert np.allclose(
+        geometry.look_at([0, 0, -3], [0, 0, 0], [0, -1, 0]), [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+    )
+    for target in ([0, -4, -3], [0, 0, -3]):
+        with pytest.raises(UsageError, match="must not be parallel"), np.errstate(invalid="ignore"):
+            geometry.look_at([0, 0, -3], target, [0, -1, 0])

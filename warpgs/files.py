@@ -110,7 +110,7 @@ MAX_HEADER_BYTES = 65536
 
 def ply_header(head: bytes) -> tuple[list[PlyElement], int, bool]:
     """Return the elements of the header in a PLY file's first bytes, the offset [bytes] of the data, and if they are ASCII."""
-    expect(re.match(rb"ply[ \t]*\r?\n", head), "it does not start with 'ply'")
+    expect(re.match(rb"ply[ \t]*\r?\n", head), "it does not start with 'ply' (other formats: warpgs.export.read_gaussians)")
     end: Any = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
     expect(end, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
     elements: list[PlyElement] = []
@@ -195,6 +195,8 @@ UNDECODABLE = re.compile("[\udc80-\udcff]")
 """Characters that Python puts in the place of bytes that are not UTF-8."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of an exhausted disk quota."""
+FIXES = {errno.ENOENT: "create its folder", errno.EACCES: "change its permissions"}
+"""What to do about an error, other than to free disk space."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
 """Errors of file systems that cannot sync a folder."""
 DESCRIPTORS = Path("/proc/self/fd")
@@ -210,7 +212,8 @@ def writable(path: Path, remedy: str = "", done: str = "written", amount: str = 
         raise ResourceError(f"{path}: cannot be {done}, as {e}") from e
     except OSError as e:
         held = WINDOWS and isinstance(e, PermissionError)
-        fix = remedy or f"{'close the programs that have it open' if held else 'free some disk space'}, or write elsewhere"
+        first = "close the programs that have it open" if held else FIXES.get(e.errno or 0, "free some disk space")
+        fix = remedy or f"{first}, or write elsewhere"
         raise ResourceError(f"{path}: {amount}cannot be {done} ({e.strerror or e}){note}; {fix}") from e
 
 

@@ -26,5 +26,5 @@ def warn_if_spinning() -> None:
         frame, level = sys._getframe(), 1
         while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in ("warpgs", "torch"):
             frame, level = frame.f_back, level + 1
-        fix = f"import warpgs before torch, set {VARIABLE}=passive, or call torch.set_num_threads(1)"
+        fix = f"set {VARIABLE}=passive, call torch.set_num_threads(1), or import warpgs before torch"
         warnings.warn(f"idle threads of torch slow down rendering on a CPU: {fix}", RuntimeWarning, stacklevel=level)

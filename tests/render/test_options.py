@@ -74,8 +74,8 @@ def test_options_are_checked_where_they_are_made():
 
 def test_a_background_is_numbers_and_a_full_device_no_wrong_background(monkeypatch):
     """Words of the command line are no numbers; what fails on the device keeps its own error."""
-    for value in ("white", ["a", "b", "c"], None.__class__):
-        with pytest.raises(TypeError, match=r"background must be numbers, shape \[3\] or \[C, 3\], not"):
+    for value in ("white", ["a", "b", "c"], None.__class__, np.uint8([255, 255, 255])):
+        with pytest.raises(TypeError, match=r"background must be numbers, 1.0 for white: \[3\] or \[C, 3\], not"):
             rasterize(cloud(1), camera(37, 30), RasterizeOptions(background=value))
 
     def full(*_, **__):

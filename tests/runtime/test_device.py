@@ -414,5 +414,5 @@ def test_a_warning_where_torch_was_imported_first(imports, policy, warned):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     alone, *threaded = done.stderr.split("rendered 1")
     assert "OMP_WAIT_POLICY" not in alone
-    assert threaded[0].count("import warpgs before torch, set OMP_WAIT_POLICY=passive, or call") == warned
+    assert threaded[0].count("set OMP_WAIT_POLICY=passive, call torch.set_num_threads(1), or import") == warned
     assert threaded[0].count("<string>:9: RuntimeWarning") == warned  # the line that calls rasterize

@@ -131,7 +131,7 @@ def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
 
 SIGNALS = [pytest.param(s, id=n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None))]
 CONTEXTS = [interrupting_signals, noted_signals, ignored_signals]
-SENTENCE = "warpgs: interrupted; --resume continues from the last checkpoint\n"
+SENTENCE = "warpgs: interrupted; the fit is saved, --resume continues it\n"
 UNSAVED = "warpgs: interrupted; no step was saved: run the same command again\n"
 
 

@@ -30,7 +30,7 @@ def format_flags(arguments: list[str]) -> type:
         """Box to keep, in units of the scene's files: x,y,z,X,Y,Z, or a .json file such as the one that the viewer saves."""
         clean: tyro.conf.FlagCreatePairsOff[bool] = False
         """Remove floaters and needles: Gaussians that no training view of a run sees, that are larger than the scene, or that
-        are long and thin. Default: on, except for .ply files."""
+        are long and thin. On without this flag, except for .ply files."""
         no_clean: tyro.conf.FlagCreatePairsOff[bool] = False
         """Keep floaters and needles."""
         sh_degree: int | None = None

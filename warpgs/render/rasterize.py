@@ -236,7 +236,7 @@ def _checked_channels(name: str, values: Tensor | None, inputs: ProjectInputs) -
     pattern = "C N D" if isinstance(values, Tensor) and values.ndim == 3 else "N D"
     if pattern == "C N D" and name == "colors" and len(values) == len(inputs.means) != len(inputs.viewmats):
         found = list(values.shape)
-        raise ValueError(f"colors {found} are neither [N, D] nor [C, N, D]: give spherical harmonics as sh of the Gaussians")
+        raise ValueError(f"colors {found} are neither [N, D] nor [C, N, D]; harmonics need sh_degree, or Gaussians with sh")
     launch.check(means=(inputs.means, "N 3"), viewmats=(inputs.viewmats, "C 4 4"), **{name: (values, pattern)})
     if values.shape[-1] == 0:
         raise ValueError(f"{name} must have at least one channel, not shape {list(values.shape)}")
@@ -274,10 +274,10 @@ def _layer(name: str, background: Any, colors: Tensor | None, inputs: ProjectInp
         background = like.new_zeros(channels)
     try:
         values = _as_tensor(background)
-        if values.is_complex():
+        if values.is_complex() or values.dtype == torch.uint8:
             raise TypeError(values.dtype)
     except (RuntimeError, TypeError, ValueError) as e:
-        raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {background!r}") from e
+        raise TypeError(f"{name} must be numbers, 1.0 for white: [{channels}] or [C, {channels}], not {background!r}") from e
     if values.layout != torch.strided:
         raise TypeError(f"{name} must be dense, not {values.layout}; {name}.to_dense() converts it")
     values = values.to(like)

@@ -496,7 +496,7 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
         )  # fmt: skip
     except KeyboardInterrupt as e:
         saved = r.out is not None and (r.out / TENSORS).is_file()
-        again = "--resume continues from the last checkpoint" if saved else "no step was saved: run the same command again"
+        again = "the fit is saved, --resume continues it" if saved else "no step was saved: run the same command again"
         raise KeyboardInterrupt(again) from e
 
 
