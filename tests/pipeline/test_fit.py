@@ -117,6 +117,12 @@ def test_a_result_is_scored_over_the_background_of_its_fit(folder, recwarn):
     assert len(told) == 1
     with pytest.raises(TypeError, match="gaussians must be an instance of Gaussians"):
         warpgs.evaluate(3, views)
+    # as after a scene was loaded without some photographs, which moves its origin
+    viewmat = views[0].camera.viewmat.copy()
+    viewmat[0, 3] += 0.01
+    moved = dataclasses.replace(views[0].camera, viewmat=viewmat)
+    with pytest.warns(UserWarning, match="the pose of view .* is not that of the fit; load the scene with"):
+        warpgs.evaluate(result, [dataclasses.replace(views[0], camera=moved)])
     alpha = np.pad(np.ones((20, 20), np.float32), ((6, 6), (10, 10)))
     for color, count in (1.0, 0), (0.0, 1):
         cut_out = [dataclasses.replace(v, alpha=alpha, image=np.where(alpha[..., None] > 0, v.image, color)) for v in views]

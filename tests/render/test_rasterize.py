@@ -124,7 +124,7 @@ def test_arguments_of_another_type_or_shape_are_named():
         (TypeError, "quats must be dense, not torch.sparse", scene(quats=gaussians.quats.to_sparse())),
         (ValueError, "camera.K has non-finite values", seen(K=no_number)),
         (ValueError, r"background must have shape \[3\] or \[C, 3\], C=1, not \[2, 3\]", asked(background=torch.zeros(2, 3))),
-        (ValueError, r"colors \[3, 4, 3\] .* give spherical harmonics as sh of", asked(colors=torch.zeros(3, 4, 3))),
+        (ValueError, r"colors \[3, 4, 3\] .* harmonics need sh_degree", asked(colors=torch.zeros(3, 4, 3))),
         *(
             (TypeError, f"means must be float32 or float64, not {t}; means.float", scene(**of(t)))
             for t in (torch.half, torch.int64)

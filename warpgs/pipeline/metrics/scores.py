@@ -222,6 +222,8 @@ class Fitted(Protocol):
         """Return the options that the fit renders with."""
 
 
+MOVED = 1e-3
+"""Difference of a pose [u] above which a view was loaded with other flags, such as other left-out photographs."""
 NOTICED = 0.5 / 255
 """Mean part of the background in a view's pixels above which it matters which one it is: half a level of an 8-bit image."""
 
@@ -247,6 +249,7 @@ def evaluate(
         DataError: A field of a view is invalid; the message names the view, the field and the fix.
     """
     views, known = checked_views(views), options is not None or isinstance(gaussians, Fitted)
+    cameras = getattr(gaussians, "scene_cameras", {})
     if isinstance(gaussians, Fitted):
         options = gaussians.options() if options is None else options
         gaussians = gaussians.gaussians()
@@ -257,6 +260,8 @@ def evaluate(
         image, _, alpha = render_view(gaussians, v, options)
         scores.append(score(v, image, lpips, alpha))
         doubts += _doubts(v, alpha, options, known)
+        if v.name in cameras and not np.allclose(cameras[v.name].viewmat, v.camera.viewmat, atol=MOVED):
+            doubts.append(f"the pose of view {v.name} is not that of the fit; load the scene with the flags of the fit")
     if doubts:
         warnings.warn(f"evaluate: {doubts[0]}", stacklevel=2)
     return scores

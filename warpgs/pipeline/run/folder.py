@@ -338,8 +338,11 @@ def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> 
         )
         outside = [name for name in needed if ":" in name]
         if set(outside) - set(named):
-            fix = f"A run folder never decides which code is loaded; give --{field.replace('_', '-')} {','.join(outside)} again"
-            raise UsageError(f"--resume: the run in {out} was fitted with user code. {fix}")
+            code = ", ".join(name.rpartition(":")[2] for name in outside)
+            fix = f"repeat the whole command of the fit, with --resume (--{field.replace('_', '-')} or --preset named the code)"
+            raise UsageError(
+                f"--resume: the run in {out} was fitted with user code ({code}), which no run folder may load; {fix}"
+            )
 
 
 @dataclass(frozen=True, repr=False)
@@ -399,9 +402,9 @@ def stored_request(folder: Path, moved: str | None = None) -> FitRequest:
     """Return the request that continues a run, with all its settings, and its scene, which may have ``moved``."""
     record = read_record(folder)
     _check_lost(record, folder)
+    _check_named_again({}, record["config"], folder)
     try:
         scene = _stored_scene(folder, record, None, moved)
-        _check_named_again({}, record["config"], folder)
     except UsageError as e:
         raise UsageError(f"{e}, with the scene and all other flags of the run") from e
     try:
