@@ -8,6 +8,7 @@ import itertools
 import json
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,6 +59,7 @@ OWN = """
 from warpgs.pipeline.train.settings import FitConfig
 PLAIN = FitConfig(steps=5)
 SOME = {"base": "quick", "init": {"opacity": 0.5}}
+BESIDE = {"base": "my.toml", "steps": 7}
 NUMBER = 3
 """
 
@@ -157,6 +159,9 @@ def test_objects_mappings_and_registered_names_are_presets(own, monkeypatch):
     assert config.init.opacity == 0.5 and config.max_steps == 300 and "), preset quick" in origin
     assert origin.startswith(f"{own}:SOME (SHA-256 ")
     assert preset_settings({"base": "quick", "init.opacity": 0.5})[0] == config
+    written(Path(own).parent, "init.opacity = 0.5")
+    beside = preset_settings(f"{own}:BESIDE")[0]  # a file beside the code, not in the current folder
+    assert (beside.steps, beside.init.opacity) == (7, 0.5)
     for wrong, said in (
         (f"{own}:NUMBER", "is of type int"),
         (f"{own}:NONE", "does not exist"),

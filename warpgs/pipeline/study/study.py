@@ -22,7 +22,7 @@ from warpgs.pipeline.farm.work import Outcome, ensure_run
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import over_white, render_view
 from warpgs.pipeline.paper.strategy import UNIFORM, PaperConfig
-from warpgs.pipeline.run.folder import open_run
+from warpgs.pipeline.run.folder import open_run, versions
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import LABELS, summary_line
 from warpgs.pipeline.study import tables
@@ -263,7 +263,8 @@ def write_study(request: StudyRequest, runs: Runs, places: Places, device: torch
     parts = [f"# {table.caption}", text]
     if len(scenes) > 1:
         parts += [f"## {s}\n\n{tables.markdown(_table(request, runs, [s], s))}" for s in scenes]
-    scored = "\n".join([*_protocols(runs), f"- device: {device_name}"])
+    made = ", ".join(f"{name} {versions()[name]}" for name in ("warpgs", "torch", "warp-lang"))
+    scored = "\n".join([*_protocols(runs), f"- device: {device_name}", f"- versions: {made}"])
     parts += [f"## How it was scored\n\n{scored}", "## Notes\n\n" + "\n".join(f"- {n}" for n in notes)]
     write_text(out / "table.md", "\n\n".join(p.strip() for p in parts) + "\n")
     write_csv(out / "table.csv", tables.csv_rows(table))

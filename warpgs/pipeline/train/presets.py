@@ -108,8 +108,10 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
     found = load_object("preset", name)
     if not isinstance(found, (FitConfig, Mapping)):
         raise UsageError(f"the preset {name!r} is of type {type(found).__name__}; make it a FitConfig or a mapping of settings")
-    config, origin = preset_settings(found) if isinstance(found, FitConfig) else _config_of(found, name, 0)
-    digest = module_digest(module_of(name.rpartition(":")[0]))
+    where = name.rpartition(":")[0]
+    folder = Path(where).parent if where.endswith(".py") else None
+    config, origin = preset_settings(found) if isinstance(found, FitConfig) else _config_of(found, name, 0, folder)
+    digest = module_digest(module_of(where))
     return config, f"{name}{f' (SHA-256 {digest[:12]})' if digest else ''}, {origin}"
 
 
