@@ -116,7 +116,7 @@ def source(name: str) -> str:
     if values["machine"]["device"] == "cpu":
         machine += ", " + values["machine"]["name"].replace("(R)", "").removesuffix(" Processor")
     command = re.sub(r" --out [\w./]+", "", values["command"] or "")
-    command = re.sub(r"^(python -m \S+)( \S+){7,}$", r"\1 ...", command)
+    command = re.sub(r"^python -m (\S+)( \S+){7,}$", r"\1", command)
     fence = "``" if "`" in command else "`"
     ran = f"{fence}{command}{fence}" if command else "command not kept"
     commit = values.get("commits", {}).get("new") or values["commit"] or "not kept"
