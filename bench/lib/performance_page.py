@@ -55,7 +55,7 @@ def fits_table(results: dict[str, dict]) -> str:
         ("rows_h200", "fox:8", "fox, 8 photographs of 270 x 480 px, H200"),
         ("dense_h200", "fox:all", "fox, 43 photographs of 270 x 480 px, H200"),
         ("dense_h200", "horns:54", "horns, 54 photographs of 504 x 378 px, H200"),
-        ("fern_cpu2", "", "fern, 3 photographs of 504 x 378 px, 2 cores"),
+        ("fern_cpu2", "fern llff:3", "fern, 3 photographs of 504 x 378 px, 2 cores"),
         ("temple_cpu2", "", "temple, 12 photographs of 640 x 480 px, 2 cores"),
     ):
         rows = [r for r in results[name]["rows"] if r["side"] == "new" and scene in ("", r.get("scene"))]

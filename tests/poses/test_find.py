@@ -415,6 +415,10 @@ def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, 
     found = found_mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
     notes = record_of(found, unposed(range(count), focal), "0", [])["notes"]
     assert any(f"An estimate from {count} photographs is often 5 % off" in n for n in notes) is said
+    assert not any("times their longer side" in n for n in notes)
+    stretched = {"focal": 900, "distortion": 0, "width": 320, "height": 240}
+    notes = record_of(found_mapping(cameras=(stretched,)), unposed(range(5), focal), "0", [])["notes"]
+    assert any("photographs of 320 x 240 px have a focal length of 2.8 times their longer side" in n for n in notes)
 
 
 def test_records_reasons_and_advice():

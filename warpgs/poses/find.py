@@ -121,6 +121,10 @@ _RECORD = schema.fields(
 )  # fmt: skip
 
 
+USUAL = (0.4, 2.5)
+"""Focal lengths relative to the longer side: of ultra-wide lenses without correction, and of a phone's telephoto lens."""
+
+
 def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: str, notes: Sequence[str]) -> dict[str, Any]:
     """Return the contents of poses.json; ``digest`` is the hash of the source, ``notes`` are choices made for the user."""
     names = [p.name for p in photographs]
@@ -151,6 +155,11 @@ def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: 
             f"EXIF holds no focal length. An estimate from {count} is often 5 % off, at worst 20 % or more, and so is depth. "
             "Add photographs from more directions"
         )
+    for c in found.cameras:
+        width, height, times = c["width"], c["height"], c["focal"] / max(c["width"], c["height"])
+        if not USUAL[0] < times < USUAL[1]:
+            seen = f"photographs of {width:.0f} x {height:.0f} px have a focal length of {times:.2g} times their longer side"
+            remarks.append(f"{seen}, usual are 0.7 to 1.5: leave them out if they are cropped or stretched")
     if found.method == "global":
         remarks.append("global mapping joined more photographs than incremental mapping; results differ a little between runs")
     return {
