@@ -338,11 +338,11 @@ def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> 
         )
         outside = [name for name in needed if ":" in name]
         if set(outside) - set(named):
-            code = ", ".join(name.rpartition(":")[2] for name in outside)
-            fix = f"repeat the whole command of the fit, with --resume (--{field.replace('_', '-')} or --preset named the code)"
-            raise UsageError(
-                f"--resume: the run in {out} was fitted with user code ({code}), which no run folder may load; {fix}"
+            flags = (
+                f"with --resume and all its flags, --{field.replace('_', '-')} {','.join(outside)} or the preset that named it"
             )
+            fix = f"which no run folder may load; repeat the whole command of the fit, {flags}"
+            raise UsageError(f"--resume: the run in {out} was fitted with user code, {fix}")
 
 
 @dataclass(frozen=True, repr=False)
