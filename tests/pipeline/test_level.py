@@ -288,6 +288,10 @@ def test_the_error_of_a_pick_depends_on_what_confirms_it(run, monkeypatch):
         assert places[-1][2] == source and 0.999 * wanted < math.sqrt(axis @ places[-1][1] @ axis) / 2 < wanted + pixel
     edges = "; at an edge: point 6, point 7; pick places away from edges"
     assert level.matches(places) == "; 1 of 6 picks were matched in training photographs" + edges
+    unmatched = [(*place[:2], "shown") for place in places[:2]]
+    assert level.matches(unmatched).endswith(
+        "0 of 2 picks were matched in training photographs; pick other places for a smaller error"
+    )
     assert "edge" not in level.matches(places[:5])
 
 

@@ -198,7 +198,8 @@ def matches(places: Sequence[Place], why: str = "") -> str:
     matched, picks = sources.count("matched"), len(sources) - sources.count("given")
     edges = [f"point {i}" for i, source in enumerate(sources, 1) if source == "edge"]
     line = f"; {matched} of {picks} picks were matched in training photographs{why}"
-    return line + f"; at an edge: {', '.join(edges)}; pick places away from edges" * bool(edges)
+    other = "pick other places for a smaller error" * (matched < picks and not why)
+    return line + (f"; at an edge: {', '.join(edges)}; pick places away from edges" if edges else f"; {other}" * bool(other))
 
 
 def picked(run: StoredRun, text: str, photographs: Mapping[str, np.ndarray]) -> Place:
