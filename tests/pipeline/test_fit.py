@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import html
 import json
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -99,6 +100,7 @@ def test_command_and_function_are_one_fit(folder, fitted):
         assert total == pytest.approx(sum(times.values())) and total >= metrics["seconds"]["total"]
         assert {"kernels", "photo checks", "first points", "steps (phase 2)", "scoring", "checks", "other"} <= times.keys()
     assert {"import", "reading", "report", "writing"} <= stored["wall_seconds"].keys()
+    assert re.match("start: [0-9,]+ (random )?points", stored["start"])
     assert not {"import", "reading", "report"} & fitted[0].metrics["wall_seconds"].keys()
     assert "<li>wall time until this page was written: " in (folder / "run" / "report.html").read_text()
 

@@ -343,6 +343,7 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
     for i, path in enumerate(sorted((request.out / "other").glob("*/*/metrics.json"))):
         metrics = json.loads(path.read_text())
         metrics["test"]["psnr"] += i**2  # the same data, so that nothing is fitted, with other scores
+        metrics["start"] = "start: 9 random points, instead of --init.source sweep: only 3 survived"
         path.write_text(json.dumps(metrics))
     run_study(request)
     assert set(states(request)) == {"kept"}
@@ -355,7 +356,9 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
     assert tables[0][3][1].strip("*") == f"{np.mean(psnr['b b']):.2f} ± {np.std(psnr['b b'], ddof=1):.2f}"
     d = paired_difference(psnr["b b"], psnr["a"])
     assert tables[1][2][1].removesuffix(" \\*") == f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"
-    assert "on these scenes, not other scenes" in (request.out / "table.md").read_text()
+    notes = (request.out / "table.md").read_text()
+    assert "on these scenes, not other scenes" in notes
+    assert notes.count("other, a, seed 1: start: 9 random points, instead of") == 1 and "still, a, seed 1: start" not in notes
 
 
 def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):

@@ -631,6 +631,7 @@ def _score(
         (complexity, [Detail(complexity_summary(complexity))]),
         ({"photographs": [vars(p) | {"moved": moved.get(p.name)} for p in checks]}, []),
         ({"view_modules": modules}, [e["summary"] for e in modules.values()]),
+        ({"start": next((n for n in trainer.notes if n.startswith("start: ")), "")}, []),
         ({"given": mapped}, [e["summary"] for e in mapped.values()]),
     ]
     for figures, sentences in table:

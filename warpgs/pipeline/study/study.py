@@ -201,6 +201,8 @@ def _figure(request: StudyRequest, runs: Runs, places: Places, device: torch.dev
 def _notes(request: StudyRequest, runs: Runs) -> list[str]:
     """Return the caveats that a reader of the tables needs."""
     notes = [f"{p}, {v}, seed {s}: {note}" for (p, v, s), (_, _, note) in runs.items() if note]
+    starts = {(p, v, s): (metrics or {}).get("start", "") for (p, v, s), (_, metrics, _) in runs.items()}
+    notes += [f"{p}, {v}, seed {s}: {start}" for (p, v, s), start in starts.items() if "instead of --init.source" in start]
     for v in request.variants:
         lost = [f"{p} seed {s}" for (p, name, s), (_, metrics, _) in runs.items() if name == v and metrics is None]
         if lost:
