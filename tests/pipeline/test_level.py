@@ -147,6 +147,7 @@ def test_files_get_a_length_and_a_level_ground(run, tmp_path, capsys):
     turns, centers = poses(run, tmp_path / "cameras")
     assert 100 * abs(steps(centers) / steps(TRUE) - 1).max() < min(1, 2 * percent) and percent < 3
     assert all(degrees_apart(turn @ UP, UP) < min(1, 2 * tilt) for turn in turns) and tilt < 12
+    assert ("pick three points farther apart" in said) == (tilt > level.UNSURE)
     assert main(["export", str(run), "--to", str(tmp_path / "a.ply")]) == 0
     means = warpgs.read_ply(tmp_path / "a.ply").means.numpy()
     np.testing.assert_array_equal(means, warpgs.read_ply(run / "point_cloud.ply").means.numpy())
