@@ -127,6 +127,56 @@ def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
         assert done.returncode == code and not mark.exists(), f"{name}: {done.stdout}{done.stderr}"
 
 
+STARTERS = {
+    "os": ("system", "popen", "exec", "spawn", "posix_spawn", "startfile", "fork"),
+    "asyncio": ("create_subprocess",), "subprocess": ("",), "multiprocessing": ("",), "pty": ("",), "commands": ("",),
+    "concurrent.futures": ("ProcessPoolExecutor", "process"), "torch.multiprocessing": ("",), "runpy": ("",), "code": ("",),
+}  # fmt: skip
+"""Beginnings of names, by module, that start processes or shells, or run code by its path."""
+
+
+def dotted(node: ast.AST) -> str:
+    """The name of a module as it is written: a.b; something else for what is no name."""
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else "?"
+
+
+def starters(path: Path) -> list[str]:
+    tree = ast.parse(path.read_text("utf-8"))
+    found, names = [], {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {a.asname or a.name.split(".")[0]: a.name if a.asname else a.name.split(".")[0] for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module in STARTERS:
+            found += [f"{node.module}.{a.name}" for a in node.names if a.name.startswith(STARTERS[node.module])]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, (ast.Name, ast.Attribute)):
+            head, dot, rest = dotted(node.value).partition(".")
+            module = names.get(head, "") + dot + rest
+            found += [f"{module}.{node.attr}"] * (module in STARTERS and node.attr.startswith(STARTERS[module]))
+        elif isinstance(node, ast.keyword) and node.arg == "shell":
+            found.append("shell=")
+    return found
+
+
+def test_one_file_alone_starts_processes(tmp_path):
+    """And none starts a shell; the program itself may start again. The overview names an exception of `subprocess` alone."""
+    for path in (ROOT / "warpgs").rglob("*.py"):
+        names = ("run", "DEVNULL", "CompletedProcess", "Popen", "PIPE")
+        allowed = {"process.py": {f"subprocess.{n}" for n in names} | {"os.execv"}}
+        more = {"subprocess.TimeoutExpired"}
+        assert set(starters(path)) <= allowed.get(path.name, set()) | more, path
+    # the search finds what starts processes
+    for text in (
+        "import os\nos.system('a')", "from os import popen", "import os as o\no.execvp('a', [])", "from subprocess import run",
+        "import subprocess as s\ns.Popen('a')", "f(shell=True)", "import multiprocessing as m\nm.Process()",
+        "import concurrent.futures\nconcurrent.futures.ProcessPoolExecutor()",
+    ):  # fmt: skip
+        (tmp_path / "a.py").write_text(text)
+        assert starters(tmp_path / "a.py"), text
+
+
 # Ctrl-C, SIGTERM and SIGHUP: one sentence and one exit code wherever they come, and none where they are ignored.
 
 SIGNALS = [pytest.param(s, id=n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None))]
