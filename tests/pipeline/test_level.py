@@ -147,7 +147,7 @@ def test_files_get_a_length_and_a_level_ground(run, tmp_path, capsys):
     turns, centers = poses(run, tmp_path / "cameras")
     assert 100 * abs(steps(centers) / steps(TRUE) - 1).max() < min(1, 2 * percent) and percent < 3
     assert all(degrees_apart(turn @ UP, UP) < min(1, 2 * tilt) for turn in turns) and tilt < 12
-    assert ("pick three points farther apart" in said) == (tilt > level.UNSURE)
+    assert ("pick more points, farther apart" in said) == (tilt > level.UNSURE)
     assert main(["export", str(run), "--to", str(tmp_path / "a.ply")]) == 0
     means = warpgs.read_ply(tmp_path / "a.ply").means.numpy()
     np.testing.assert_array_equal(means, warpgs.read_ply(run / "point_cloud.ply").means.numpy())
@@ -242,6 +242,31 @@ def test_coordinates_of_given_points_are_new_after_a_command(run, capsys):
             np.testing.assert_allclose(getattr(again, key), getattr(n, key), rtol=1e-6, atol=1e-6)
         capsys.readouterr()
     assert sh("level", run, "--ground", *picks(ground())) == 0 and "now at" not in capsys.readouterr().out
+
+
+def test_more_points_and_lengths_outvote_a_wrong_one(run, capsys):
+    """Five of six points lie on a slanted plane, and three of four lengths agree: the others are named, and hardly count."""
+    before = open_run(run, "cpu").normalization
+    points = np.array([[-1, 0.3, -1], [1, 0.3, -1], [1, 0.3, 1], [-1, 0.3, 1], [0.2, 0.3, 0.4], [0.7, -0.2, 0.7]]) @ TILT.T
+    assert sh("level", run, "--ground", *(",".join(map(str, point)) for point in points)) == 0
+    assert "count as exact; point 6 is farthest off it, by 0.5 units" in capsys.readouterr().out
+    placed = convert_points(
+        convert_points(points, before, "file", "scene"), open_run(run, "cpu").normalization, "scene", "file"
+    )
+    np.testing.assert_allclose(placed[:, 1], [0, 0, 0, 0, 0, -0.5], atol=1e-4)
+    lengths = "0,0,0 1,0,0 2  0,0,0 2,0,0 4  0,0,0 3,0,0 6  0,0,0 1,0,0 2.3"
+    assert sh("level", run, "--scale", *lengths.split()) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"files are 2(\.0000\d*)? times as large", said) and "+0.00, +0.00, +0.00, -13.04 % off" in said
+
+
+def test_a_plane_is_as_sure_as_its_errors_say():
+    """Of 2,000 planes through six points with unequal errors, over 60 % of the tilts are within their deviation."""
+    random = np.random.default_rng(0)
+    terms, errors = np.column_stack([np.ones(6), random.uniform(-1, 1, (6, 2))]), np.array([0.01, 0.01, 0.01, 0.02, 0.02, 0.2])
+    fits = [level.least_squares(terms, random.normal(0, errors), errors**2)[:2] for _ in range(2000)]
+    within = np.mean([np.square(found[1:]).sum() <= covariance[1:, 1:].trace() for found, covariance in fits])
+    assert 0.6 < within < 0.95, within
 
 
 def test_pixels_are_those_of_the_fit_and_a_wall_is_no_ground(run, made, tmp_path, capsys):
@@ -410,7 +435,7 @@ BAD = {
     "outside": (["--scale", f"{NAMES[0]}:96,3", f"{NAMES[1]}:3,3", "1"], "96,3: outside of the image, which has 96 x 72 px"),
     "background": (["--scale", f"{NAMES[0]}:9,3", f"{NAMES[1]}:3,3", "1"], "shows empty background .opacity 0.0"),
     "equal": (["--scale", f"{NAMES[0]}:9,3", f"{NAMES[0]}:9,3", "1"], "the two points are equal"),
-    "no length": (["--scale", "0,0,0", "1,2,3", "0"], "the length must be above 0 m, not 0"),
+    "no length": (["--scale", "0,0,0", "1,2,3", "0"], "a length must be above 0 m, not 0"),
     "unknown": (["--scale", "images/00.png:9,3", f"{NAMES[0]}:9,3", "1"], "no view 'images/00.png'; did you mean images/00"),
     "nan": (["--scale", "1,2,nan", "1,2,3", "1"], "a point, VIEW:x,y or x,y,z, takes 3 finite numbers"),
     "unit": (
@@ -418,6 +443,9 @@ BAD = {
         r"a length, such as 1.2 \(metres\), 20cm or 35mm, takes one finite number, not",
     ),
     "in line": (["--ground", "0,0,0", "1,0,0", "2,0,0"], "equal or nearly on a line"),
+    "two": (["--ground", "0,0,0", "1,0,0"], "--ground at least three points, such as a.jpg:30,59"),
+    "no length between": (["--scale", "0,0,0", "1,0,0"], "--scale takes two points and a length, such as a.jpg:41,22"),
+    "no value": (["--scale"], "--scale takes two points and a length"),
     "nothing": ([], "give one of --scale"),
     "both": (["--up", "photographs", "--ground", "0,0,0", "1,0,0", "0,1,0"], "give one of --scale"),
 }

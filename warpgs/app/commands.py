@@ -190,7 +190,7 @@ def mesh(
 
 
 def level(
-    run: Positional[Path], *, scale: tuple[str, str, str] | None = None, ground: tuple[str, str, str] | None = None,
+    run: Positional[Path], *, scale: tuple[str, ...] | None = None, ground: tuple[str, ...] | None = None,
     up: Literal["photographs"] | None = None, gps: tuple[Path, ...] | None = None, device: str = "auto",
 ) -> list[str]:  # fmt: skip
     """Give a run's files real sizes.
@@ -199,7 +199,8 @@ def level(
         run: Run folder of `warpgs fit`; its PLY is written again, and every later export has the new coordinates.
         scale: Such as a.jpg:410,220 b.jpg:95,310 1.2: two points, and the length between them, in metres, or such as 20cm.
             A point is VIEW:X,Y (a pixel of a photograph at the size of the fit) or X,Y,Z (coordinates in the run's files).
-        ground: Three points of the ground, which becomes level.
+            More lengths, in the same option, make it surer.
+        ground: Three points of the ground, which becomes level, or more, which make it surer.
         up: photographs, to level by how the photographs were held.
         gps: Metres to east, north and up by the GPS in EXIF, of the scene's photographs or of those in a folder.
         device: auto, cpu or cuda.

@@ -18,7 +18,7 @@ from warpgs.process import say_lines
 
 REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
 """What replaces flags that are gone, by their names with dashes."""
-SPELLED = {"--size": "1080 1920", "--scale": "a.jpg:41,22 b.jpg:95,31 1.2", "--ground": "a.jpg:30,59 a.jpg:20,56 b.jpg:40,58"}
+SPELLED = {"--size": "1080 1920"}
 """Examples of flags that take several values."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""

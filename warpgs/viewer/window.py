@@ -392,7 +392,7 @@ class Panel:
         def store(_: Any) -> None:
             if len(places) != 2:
                 raise UsageError("pick two points first")
-            said = level.store(self.content.stem, "cpu", lambda r: level.scaled(r.normalization, *places, length.value))
+            said = level.store(self.content.stem, "cpu", lambda r: level.scaled(r.normalization, places, [length.value]))
             self.window.show(content_of_run(self.content.stem, self.content.model.gaussians().means.device, self.content.views))
             self.measured.content = _plain(" ".join(said))
 

@@ -234,14 +234,31 @@ def metres(text: str) -> float:
     return float(number) * {"mm": 1e-3, "cm": 1e-2}.get(unit, 1.0)
 
 
-def scaled(n: Normalization, first: Place, second: Place, length: float) -> Levelled:
-    """Give files the scale at which two places are ``length`` [m] apart."""
-    if not 0 < length < math.inf:
-        raise UsageError(f"the length must be above 0 m, not {length:g}")
-    units, error = distance(n, first, second)
-    n = replace(n, offset=n.origin + (n.offset - n.origin) * (length / units), scale=n.scale * units / length, unit="m")
-    sure = f"uncertain by {100 * error:.2g} %" if error else EXACT
-    return n, f"scale: files are {length / units:.6g} times as large, in metres; {sure}"
+def least_squares(terms: np.ndarray, values: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the coefficients [K] of terms [N, K] that explain values [N] best, their covariance [K, K], and what is left [N].
+
+    Weights are those of errors with the given variances [N] and a heavy tail, so that a wrong value among many counts little.
+    """
+    left = np.zeros(len(values))
+    for _ in range(20):
+        weights = 1 / (variances + left**2 + LEAST**2)
+        covariance = np.linalg.inv(matmul((weights[:, None] * terms).T, terms))
+        found = matmul(covariance, matmul(terms.T, weights * values))
+        left = values - matmul(terms, found)
+    return found, covariance, left
+
+
+def scaled(n: Normalization, places: Sequence[Place], lengths: Sequence[float]) -> Levelled:
+    """Give files the scale at which the first two of ``places`` [2 N], and so on, are ``lengths`` [N] apart [m]."""
+    if not all(0 < length < math.inf for length in lengths):
+        raise UsageError(f"a length must be above 0 m, not {', '.join(f'{length:g}' for length in lengths)}")
+    units, errors = np.array([distance(n, *pair) for pair in zip(places[::2], places[1::2])]).T
+    (found,), ((variance,),), left = least_squares(np.ones((len(units), 1)), np.log(lengths / units), errors**2)
+    factor = math.exp(found)
+    n = replace(n, offset=n.origin + (n.offset - n.origin) * factor, scale=n.scale / factor, unit="m")
+    line = f"scale: files are {factor:.6g} times as large, in metres; "
+    line += f"uncertain by {100 * math.sqrt(variance):.2g} %" if errors.any() else EXACT
+    return n, line + f"; in them, lengths are {', '.join(f'{100 * math.expm1(-x):+.2f}' for x in left)} % off" * (len(left) > 1)
 
 
 def upright(n: Normalization, up: np.ndarray, ground: np.ndarray | None = None) -> Levelled:
@@ -257,25 +274,30 @@ def upright(n: Normalization, up: np.ndarray, ground: np.ndarray | None = None) 
 
 
 def grounded(run: StoredRun, places: Sequence[Place]) -> Levelled:
-    """Turn files so that three places lie on the ground, below the cameras."""
-    corners = np.array([point for point, *_ in places])
-    sides = np.linalg.norm(np.roll(corners, 1, 0) - np.roll(corners, -1, 0), axis=1)  # opposite to each corner
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    if not (area := float(np.linalg.norm(normal))) > max(LEAST**2, 0.01 * sides.max() ** 2):
-        raise UsageError("--ground: the three points are equal or nearly on a line; pick three that span the ground")
+    """Turn files so that three or more places lie on the ground, below the cameras; more than three by least squares."""
+    corners, errors = np.array([point for point, *_ in places]), np.array([error for _, error, _ in places])
+    middle = corners.mean(0)
+    _, sizes, axes = np.linalg.svd(corners - middle)
+    if not sizes[1] > max(LEAST, 0.01 * sizes[0]):
+        raise UsageError("--ground: the points are equal or nearly on a line; pick some that span the ground")
+    along, heights = np.split(matmul(corners - middle, axes.T), [2], axis=1)
+    variances = (matmul(errors, axes[2]) * axes[2]).sum(1)
+    terms = np.column_stack([np.ones(len(along)), along])
+    (height, *slopes), covariance, left = least_squares(terms, heights[:, 0], variances)
+    normal = axes[2] - matmul(np.array(slopes), axes[:2])
     center = np.mean([run.scene_cameras[name].center for name in run.train], axis=0)
-    normal *= np.sign(((center - corners[0]) * normal).sum()) / area
-    # a point's error along the normal tilts the plane about the opposite side
-    tilts = [math.sqrt((matmul(error, normal) * normal).sum()) * side / area for (_, error, _), side in zip(places, sides)]
-    n, line = upright(run.normalization, normal, corners[0])
+    normal *= np.sign(((center - middle) * normal).sum()) / np.linalg.norm(normal)
+    n, line = upright(run.normalization, normal, middle + height * axes[2])
     cosines = [-(run.scene_cameras[name].viewmat[1, :3] * normal).sum() for name in run.train]
     tipped = math.degrees(math.acos(np.clip(np.median(cosines), -1, 1)))
     if tipped > TIPPED:
         line += f"; this tips the photographs by {tipped:.0f} degrees: are the points on a wall? "
         line += f"`warpgs level {shlex.quote(str(run.folder))} --up photographs` undoes it"
-    tilt = math.degrees(math.hypot(*tilts))
-    wider = "; pick three points farther apart, not near a line" * (tilt > UNSURE)
-    return n, f"{line}; " + (f"the ground's tilt is uncertain by {tilt:.2g} degrees{wider}" if tilt else EXACT)
+    tilt = math.degrees(math.sqrt(covariance[1:, 1:].trace()))
+    line += f"; the ground's tilt is uncertain by {tilt:.2g} degrees" if errors.any() else f"; {EXACT}"
+    worst = int(abs(left).argmax())
+    line += f"; point {worst + 1} is farthest off it, by {abs(left[worst]) / n.scale:.2g} {n.unit}" * (len(left) > 3)
+    return n, line + "; pick more points, farther apart" * (tilt > UNSURE)
 
 
 def photographed(run: StoredRun) -> Levelled:
@@ -375,19 +397,25 @@ def store(folder: Path, device_name: str, change: Callable[[StoredRun], Levelled
 
 
 def level(
-    folder: Path, device_name: str, scale: tuple[str, str, str] | None = None, ground: tuple[str, str, str] | None = None,
+    folder: Path, device_name: str, scale: tuple[str, ...] | None = None, ground: tuple[str, ...] | None = None,
     photographs: bool = False, gps: tuple[Path, ...] | None = None,
 ) -> list[str]:  # fmt: skip
     """Set scale, upward direction or place of a run's files, with the options of `warpgs level`; returns lines for the user."""
     if [scale is not None, ground is not None, photographs, gps is not None].count(True) != 1 or len(gps or ()) > 1:
         raise UsageError("give one of --scale, --ground, --up and --gps, with at most one folder")
+    if (scale is not None and (not scale or len(scale) % 3)) or (ground is not None and len(ground) < 3):
+        raise UsageError(
+            "--scale takes two points and a length, such as a.jpg:41,22 b.jpg:95,31 1.2, once or several times, and --ground "
+            "at least three points, such as a.jpg:30,59 a.jpg:20,56 b.jpg:40,58"
+        )
 
     def change(run: StoredRun) -> Levelled:
-        texts, length = (scale[:2], metres(scale[2])) if scale else (ground or (), 0.0)
-        photos, why = photographs_of(run) if any(":" in text for text in texts) else ({}, "")
-        if not (places := [picked(run, text, photos) for text in texts]):
+        if photographs or gps is not None:
             return photographed(run) if photographs else located(run, *(gps or [None]))
-        n, line = scaled(run.normalization, *places, length) if scale else grounded(run, places)
+        texts = ground or [text for i, text in enumerate(scale) if i % 3 < 2]
+        photos, why = photographs_of(run) if any(":" in text for text in texts) else ({}, "")
+        places = [picked(run, text, photos) for text in texts]
+        n, line = grounded(run, places) if ground else scaled(run.normalization, places, [*map(metres, scale[2::3])])
         if names := dict.fromkeys(text.rpartition(":")[0] for text in texts if ":" in text):
             line += f"; pixels refer to photographs of {' and '.join(dict.fromkeys(fitted_size(run, name) for name in names))}"
             line += matches(places, why)
