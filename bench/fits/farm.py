@@ -135,7 +135,7 @@ def engines(scenes: int, steps: int, slots: int, work: Path) -> list[dict]:
         out = work / way.replace(" ", "-").replace(",", "")
         out.mkdir()
         row = timed(jobs_of(found, out, config), lambda: make_engine("cpu", request[0], slots=request[1]), show)  # noqa: B023
-        rows.append({"way": way, "slots": request.slots, **row, "same_bytes": digests(out, names) == wanted})
+        rows.append({"way": way, "slots": request[1], **row, "same_bytes": digests(out, names) == wanted})
     row = shared(found, work / "scenes", work / "shared", steps)
     rows.append({"way": "two farms of 1 slot", "slots": 2, **row, "same_bytes": digests(work / "shared", names) == wanted})
     for row in rows:
@@ -153,10 +153,12 @@ def gpu_slots(gpus: int, per_gpu: int, most_gpus: int) -> list[Slot]:
     return [("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
 
 
-def seeds_of(scene: SceneRequest, config: FitConfig, out: Path, kind: str, count: int) -> list[FarmJob]:
+def seeds_of(
+    scene: SceneRequest, config: FitConfig, out: Path, kind: str, count: int, device: str = "cuda"
+) -> list[FarmJob]:  # fmt: skip
     """Return jobs of one scene with a seed each."""
     return [
-        FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(config, seed=i), "cuda"), out / n, out)
+        FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(config, seed=i), device), out / n, out)
         for i, n in enumerate(f"{kind}{i}" for i in range(count))
     ]
 
@@ -167,9 +169,9 @@ def pack(slots: list[Slot], tiny: list[FarmJob], jobs: list[FarmJob]) -> dict:
 
     def show(_: list[JobStatus]) -> None:
         """Note on which GPU a job runs."""
-        for name, number in engine.workers().items():
+        for name, worker in dict(engine._workers).items():
             if name not in gpu_of:
-                variables = Path(f"/proc/{number}/environ").read_text("utf-8", "replace").split("\0")
+                variables = Path(f"/proc/{worker._process.pid}/environ").read_text("utf-8", "replace").split("\0")
                 gpu_of[name] = next(v.partition("=")[2] for v in variables if v.startswith("CUDA_VISIBLE_DEVICES="))
 
     try:

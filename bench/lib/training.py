@@ -90,6 +90,7 @@ class Steps:
         self.taker = StepTaker(self.table, LearnedViews((), (), device), strategy, cameras, self.options)
         self.buffers = self.taker.buffers
         self.views = ViewStack(camera, target[None], None, {}, torch.zeros(1, dtype=torch.int64, device=device))
+        self.taker.stacks, self.taker.captured = {KIND: self.views}, True
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
         self._load(range(1, (MAX_STEPS if device.type == "cuda" else 1) + 1))
 
@@ -108,7 +109,6 @@ class Steps:
 
     def replay(self) -> None:
         """Take the first step of a batch as a CUDA graph, again and again; captured at the first call."""
-        taker = self.taker
-        replay = taker.works(taker.step, [KIND], self.buffers, {KIND: self.views}, self.plan, None, captured=True)[0]
+        replay = self.taker.works(self.taker.step, [KIND], self.buffers, self.plan)[0]
         self.buffers.counter.zero_()
         replay()

@@ -51,8 +51,8 @@ LEAST = 1e-6
 TIPPED = 45.0
 """Median angle [deg] between the ground's normal and the photographs' upward axes above which the points may be on a wall."""
 UNSURE = 2.0
-"""Uncertainty of the ground's tilt above which other points are asked for [deg]. On a quick fit of the demo, 66 % of 3,000
-random triangles of matched picks are within 1 degree, and 93 % of those that are at least 1 u high."""
+"""Uncertainty of the ground's tilt above which more points are asked for [deg]. On a quick fit of a demo that chose no number,
+of 3,000 grounds by 3, 5 and 8 of 102 matched picks 70, 95 and 99.7 % are within 1 degree; below this bound, 92 % or more."""
 LEANING = math.radians(3)
 """Angle from level at which the weight of a photograph is halved."""
 SURE = 1.0
