@@ -1,6 +1,5 @@
 """The benches: programs run on tiny sizes, studies compute what they say, results are of one format."""
 
-import dataclasses
 import json
 import math
 import sys
@@ -10,7 +9,6 @@ import torch
 
 import warpgs
 from bench import __main__ as bench_main
-from bench.fits import farm
 from bench.lib import ops, pages, peers, result_file, timing, training
 from bench.lib.inputs import camera as bench_camera, gaussians, image
 from bench.lib.naive import rasterize as bench_programs_rasterize
@@ -19,10 +17,7 @@ from bench.lib.ops import Bench, run
 from bench.lib.points import Point, growth, points
 from bench.lib.tables import mean_sd
 from tests.gaussians import camera, cloud
-from warpgs.pipeline.run.request import SceneRequest
-from warpgs.pipeline.train.presets import PRESETS
 from warpgs.scene import Gaussians
-from warpgs.synthetic.demo import write_demo
 
 CPU = torch.device("cpu")
 
@@ -42,16 +37,6 @@ def tiny(names: tuple[str, ...]) -> dict:
 @pytest.fixture(scope="module")
 def result():
     return tiny(("adam", "knn"))
-
-
-@pytest.mark.slow
-def test_a_packed_farm_tells_when_its_gpus_end(tmp_path):
-    """`pack` names the GPU of each job by the environment of its process, here on the CPU."""
-    write_demo(tmp_path / "demo", views=8, width=48, height=36)
-    scene, config = SceneRequest(str(tmp_path / "demo")), dataclasses.replace(PRESETS["quick"], steps=2)
-    first, jobs = (farm.seeds_of(scene, config, tmp_path / "out", kind, n, "cpu") for kind, n in (("tiny", 1), ("fit", 2)))
-    row = farm.pack([("cpu", 1, {"CUDA_VISIBLE_DEVICES": "3"})], first, jobs)
-    assert row["fits"] == 2 and row["failed"] == 0 and list(row["idle_at_the_end"]) == ["3"] and row["mean_sections"]
 
 
 @pytest.mark.slow

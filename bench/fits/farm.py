@@ -153,12 +153,10 @@ def gpu_slots(gpus: int, per_gpu: int, most_gpus: int) -> list[Slot]:
     return [("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
 
 
-def seeds_of(
-    scene: SceneRequest, config: FitConfig, out: Path, kind: str, count: int, device: str = "cuda"
-) -> list[FarmJob]:  # fmt: skip
+def seeds_of(scene: SceneRequest, config: FitConfig, out: Path, kind: str, count: int) -> list[FarmJob]:
     """Return jobs of one scene with a seed each."""
     return [
-        FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(config, seed=i), device), out / n, out)
+        FarmJob(n, FitRequest(scene, out / n / "run", dataclasses.replace(config, seed=i), "cuda"), out / n, out)
         for i, n in enumerate(f"{kind}{i}" for i in range(count))
     ]
 
