@@ -613,10 +613,11 @@ def limited_on_cpu(config: FitConfig, views: int, pixels: float) -> tuple[int, i
         most = max(fewest, every) if steps == config.steps else fewest
     if (steps, most) == (config.steps, config.max_gaussians):
         return steps, most, ""
-    capped = f", with at most {most:,} Gaussians" if most < config.max_gaussians else ""
+    limits = [f"takes {steps:,} of {config.steps:,} steps"] * (steps < config.steps)
+    limits += [f"has at most {most:,} Gaussians"] * (most < config.max_gaussians)
     whole = float(step_times(config, views, pixels, start, growing=True)[0].sum())
     return steps, most, (
-        f"to save time on a CPU, the fit takes {steps:,} of {config.steps:,} steps{capped}; --no-cpu-limit takes all, about "
+        f"to save time on a CPU, the fit {' and '.join(limits)}; --no-cpu-limit lifts this, takes about "
         f"{max(1, round(whole / 60))} min" + f", and raised PSNR by {GAIN_DB}" * (steps < NEARLY_ALL * config.steps)
     )  # fmt: skip
 
