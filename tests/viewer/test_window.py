@@ -311,7 +311,7 @@ def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
 
 
 def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path, monkeypatch):
-    """Two clicks at a training camera are its pixels on the command line; a typed length becomes the scale of the files.
+    """Clicks at a training camera are its pixels on the command line; a length becomes the scale, three points the ground.
 
     Clicks are matched in training photographs, except at edges, as by the command; without them, depth is the model's.
     """
@@ -335,7 +335,7 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path, monkey
     eye = SimpleNamespace(wxyz=wxyz_of(camera), position=camera.center, fov=fov_y(camera))
     eye.image_width, eye.image_height = SIZE
     try:
-        button(window, "click two points").value = True
+        button(window, "click points").value = True
         (click,), (store,) = server.scene._scene_pointer_cb, button(window, "set scale")._impl.update_cb
 
         def measured(*ends):
@@ -346,17 +346,31 @@ def test_the_ruler_picks_and_scales_as_the_command_does(folder, tmp_path, monkey
 
         measured(0)
         store(None)
-        assert "pick two points first" in panel._note.content
+        assert "pick 2 points first" in panel._note.content
         photographs, _ = level.photographs_of(model)
         places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}", photographs) for i in (0, -1)]
         units, error = level.distance(model.normalization, *places)
-        told = f"{units:.4g} units, uncertain by {100 * error:.2g} %; 1 of 2 picks were matched in training photographs"
+        told = f"2 points; {units:.4g} units between the last two, uncertain by {100 * error:.2g} %; 1 of 2 picks"
+        told += " were matched in training photographs"
         assert measured(-1) == told + "; at an edge: point 1; pick places away from edges" and asked == [model.train] * 2
         button(window, "length [m]").value = 3.0
         store(None)
-        assert "in metres" in panel.measured.content and measured(0, -1).startswith("3 m,")
+        assert "in metres" in panel.measured.content and measured(0, -1).startswith("4 points; 3 m between the last two,")
+        button(window, "click points").value = False
+        button(window, "click points").value = True  # picks begin anew
+        (click,) = server.scene._scene_pointer_cb
         window.show(dataclasses.replace(window.content, views={}))
         assert "%; 0 of 2 picks were matched in training photographs; at an edge: point 1;" in measured(0, -1)
+        assert pressed(window, "set ground") == "pick 3 points first"
+        measured(len(rows) // 2)
+        pressed(window, "set ground")
+        assert "the ground's tilt is uncertain by" in panel.measured.content
+        places = [level.picked(model, f"{model.train[0]}:{columns[i]},{rows[i]}", {}) for i in (0, -1, len(rows) // 2)]
+        up, by_photographs = level.grounded(model, places)[0].up, level.photographed(model)[0].up
+        np.testing.assert_allclose(warpgs.open_run(run).normalization.up, up, atol=1e-6)
+        pressed(window, "level by photographs")
+        np.testing.assert_allclose(warpgs.open_run(run).normalization.up, by_photographs, atol=1e-6)
+        assert np.abs(up - by_photographs).max() > 0.01
     finally:
         window.close()
         stop_server(server)

@@ -7,7 +7,7 @@ import itertools
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -373,32 +373,42 @@ class Panel:
         save.on_click(guarded(store, self.explain))
 
     def _add_ruler(self) -> None:
-        """Add controls that measure the distance of two picked points, and set the scale of a run's files by it."""
+        """Add controls that measure between picked points, and set the scale and the ground of a run's files by them."""
         gui, scene, run = self.server.gui, self.server.scene, isinstance(self.content.model, StoredRun)
         with gui.add_folder("Ruler", expand_by_default=False):
-            measure, self.measured = gui.add_checkbox("click two points", False), gui.add_markdown("")
+            measure, self.measured = gui.add_checkbox("click points", False), gui.add_markdown("")
             length = gui.add_number("length [m]", 1.0, min=0.0, max=1e6, step=0.001, visible=run)
-            save = gui.add_button("set scale", visible=run)
+            buttons = [gui.add_button(text, visible=run) for text in ("set scale", "set ground", "level by photographs")]
         places: list[level.Place] = []
+
+        def start(_: Any) -> None:
+            scene.remove_click_callback()
+            if measure.value:
+                places.clear()
+                scene.remove_by_name("/ruler")
+                scene.on_click()(guarded(pick, self.explain))
 
         def pick(event: Any) -> None:
             place, n = self.window.place_at(event.client, *event.screen_pos), self.content.model.normalization
-            places[:] = [*places, place] if len(places) == 1 else [place]
+            if places:
+                distance, error = level.distance(n, places[-1], place)
+                said = f"{distance:.4g} {n.unit} between the last two, uncertain by {100 * error:.2g} %"
+                self.measured.content = f"{len(places) + 1} points; {said}{level.matches([*places, place])}"
+            places.append(place)
             scene.add_icosphere(f"/ruler/{len(places)}", 0.01 * self.window.extent, (255, 221, 51), position=place[0])
-            if len(places) == 2:
-                distance, error = level.distance(n, *places)
-                self.measured.content = f"{distance:.4g} {n.unit}, uncertain by {100 * error:.2g} %{level.matches(places)}"
 
-        def store(_: Any) -> None:
-            if len(places) != 2:
-                raise UsageError("pick two points first")
-            said = level.store(self.content.stem, "cpu", lambda r: level.scaled(r.normalization, places, [length.value]))
+        def store(least: int, change: Callable[[StoredRun], level.Levelled]) -> None:
+            if len(places) < least:
+                raise UsageError(f"pick {least} points first")
+            said = level.store(self.content.stem, "cpu", change)
             self.window.show(content_of_run(self.content.stem, self.content.model.gaussians().means.device, self.content.views))
             self.measured.content = _plain(" ".join(said))
 
-        picking = guarded(pick, self.explain)
-        measure.on_update(guarded(lambda _: scene.on_click()(picking) if measure.value else scene.remove_click_callback()))
-        save.on_click(guarded(store, self.explain))
+        measure.on_update(guarded(start))
+        by_length = lambda r: level.scaled(r.normalization, places[-2:], [length.value])  # noqa: E731
+        ways = (2, by_length), (3, lambda r: level.grounded(r, places)), (0, level.photographed)
+        for button, way in zip(buttons, ways):
+            button.on_click(guarded(lambda _, way=way: store(*way), self.explain))
 
     def _save(self, name: str, values: Any) -> None:
         """Write a file beside the model, and show its path."""
