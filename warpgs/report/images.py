@@ -1,6 +1,5 @@
 """Images of a report: colour maps, crops, sheets."""
 
-import io
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -160,66 +159,6 @@ def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> n
     return image
 
 
-INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)
-BOXES = ((240, 78, 35), (0, 158, 190), (240, 190, 0))
-"""Colours of the boxes, and of the frames of their crops."""
-MAX_WIDTH = 2600
-"""Largest width of a figure of many columns [px]; exceeded if columns would be narrower than `CELL` allows."""
-CELL = (180, 480)
-"""Smallest and largest width of a column [px]."""
-GAP, MARGIN, HEAD, CAPTION = 8, 20, 38, 32
-
-
-Strip = tuple[str, list[tuple[np.ndarray, str]], list[tuple[int, int, int, int]]]
-"""One row of a figure: title; colours [H, W, 3] in [0, 1] and caption of the image by each method, all of one size; crops to
-enlarge: x, y, width, height [px]."""
-
-
-def sheet(headings: list[str], strips: list[Strip]) -> bytes:
-    """Return a figure with a cell for each heading and strip as bytes of an RGB PNG; images have the width of a column."""
-    available = (MAX_WIDTH - 2 * MARGIN + GAP) // len(headings) - GAP
-    column = max(CELL[0], min(CELL[1], available, max(320, *(cells[0][0].shape[1] for _, cells, _ in strips))))
-    bold, small = (ImageFont.load_default(max(least, column / part)) for least, part in ((17, 22), (14, 30)))
-
-    def fitted(text: str, font) -> str:
-        while text and font.getlength(text) > column:
-            text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
-        return text
-
-    rows = []
-    for title, cells, boxes in strips:
-        H, W = cells[0][0].shape[:2]
-        inner = (column - GAP * (len(boxes) - 1)) // max(len(boxes), 1)
-        zoom = GAP + max(round(inner * h / w) for _, _, w, h in boxes) if boxes else 0
-        rows.append((title, cells, boxes, inner, round(column * H / W), zoom))
-    width = 2 * MARGIN + len(headings) * (column + GAP) - GAP
-    height = MARGIN + HEAD + sum(HEAD + tall + zoom + CAPTION for *_, tall, zoom in rows) + MARGIN // 2
-    canvas = Image.new("RGB", (width, height), PAPER)
-    draw = ImageDraw.Draw(canvas)
-    for i, heading in enumerate(headings):
-        draw.text((MARGIN + i * (column + GAP) + column / 2, MARGIN + 18), fitted(heading, bold), INK, bold, anchor="ms")
-    y = MARGIN + HEAD
-    for title, cells, boxes, inner, tall, zoom in rows:
-        draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))
-        draw.text((MARGIN, y + 10), title, SOFT, small)
-        y += HEAD
-        for i, (image, caption) in enumerate(cells):
-            x, factor = MARGIN + i * (column + GAP), column / image.shape[1]
-            canvas.paste(resized(image, column, tall), (x, y))
-            for k, (cx, cy, w, h) in enumerate(boxes):
-                color, high = BOXES[k % len(BOXES)], round(inner * h / w)
-                box = [x + cx * factor, y + cy * factor, x + (cx + w) * factor - 1, y + (cy + h) * factor - 1]
-                draw.rectangle([round(v) for v in box], outline=color, width=3)
-                left, top = x + k * (inner + GAP), y + tall + GAP
-                canvas.paste(resized(image[cy : cy + h, cx : cx + w], inner, high), (left, top))
-                draw.rectangle([left, top, left + inner - 1, top + high - 1], outline=color, width=3)
-            draw.text((x + column / 2, y + tall + zoom + 20), fitted(caption, small), SOFT, small, anchor="ms")
-        y += tall + zoom + CAPTION
-    out = io.BytesIO()
-    canvas.save(out, "PNG")
-    return out.getvalue()
-
-
 CONTACT_PAPER, CONTACT_INK, CONTACT_SOFT, CONTACT_LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
 LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
 CONTACT_MARGIN, CONTACT_GAP, CONTACT_HEAD = 28, 18, 30  # [px]; HEAD is the height of a label
@@ -274,7 +213,8 @@ def contact_sheet(
     """Arrange labelled tiles of one size in rows, with colour bars of maps and lines of text; colours [rows, columns, 3]."""
     height, width = tiles[0].values.shape[:2]
     tile_height = max(1, round(tile_width * height / width))
-    rows = -(-(len(tiles) + 1) // columns)
+    cells = len(tiles) + bool(lines)
+    rows = -(-cells // columns)
     label_size, text_size, title_size, head = (round(text * v) for v in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE, CONTACT_HEAD))
     top = CONTACT_MARGIN + title_size + 18
     across = 2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP
@@ -283,7 +223,7 @@ def contact_sheet(
     draw = ImageDraw.Draw(sheet)
     fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
     draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[title_size])
-    for i in range(len(tiles) + 1):
+    for i in range(cells):
         x = CONTACT_MARGIN + (i % columns) * (tile_width + CONTACT_GAP)
         y = top + (i // columns) * (head + tile_height + CONTACT_GAP)
         if i == len(tiles):
@@ -293,7 +233,8 @@ def contact_sheet(
             draw.multiline_text((x, y + head + 14), words, CONTACT_SOFT, fonts[text_size], spacing=5)
             break
         tile = tiles[i]
-        draw.text((x, y + head // 5), tile.label, CONTACT_INK, fonts[label_size])
+        label = tile.label[: int(tile_width / (0.5 * label_size))]
+        draw.text((x, y + head // 5), label, CONTACT_INK, fonts[label_size])
         sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + head))
         if tile.values.ndim == 2:
             middle, right = y + head // 2, x + tile_width

@@ -31,24 +31,30 @@ from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import say, say_lines
-from warpgs.report.images import Strip, crops, disagreement, sheet
+from warpgs.report.images import Tile, contact_sheet, crops, disagreement, png
 from warpgs.scene import Scene, View
 
 CROPS = 2
 """Enlarged parts of each view."""
 FRACTION = 0.22
 """Width and height of a crop, as fractions of the width and height of the image."""
+MAX_WIDTH, CELL = 2600, (180, 440)
+"""Largest width of the figure of many variants, and the smallest and largest width of a column [px]."""
+BOXES = ((0.94, 0.31, 0.14), (0.0, 0.62, 0.75))
+"""Colours of the frames of the enlarged parts."""
 
 
-def strips(
+def view_sheets(
     title: str,
     views: list[View],
     folders: dict[str, Path],
     scores: dict[str, dict[str, float]],
     count: int,
     device: torch.device,
-) -> list[Strip]:
-    """Return rows of the figure of one scene: up to ``count`` held-out views on which the variants' PSNR [dB] differs most."""
+) -> list[np.ndarray]:
+    """Return sheets of up to ``count`` held-out views of a scene on which the variants' PSNR [dB] differs most."""
+    import cv2
+
     images = {}
     for name, folder in folders.items():
         run = open_run(folder, device)
@@ -57,20 +63,23 @@ def strips(
     for i, view in enumerate(views):
         values = disagreement([p[i] for p in images.values()], view.image)
         maps.append(values if view.score_mask is None else values * view.score_mask)
-    rows: list[Strip] = []
+    sheets, width = [], max(CELL[0], min(CELL[1], MAX_WIDTH // (len(images) + 1)))
     for i in sorted(sorted(range(len(views)), key=lambda i: -float(maps[i].mean()))[:count]):
         view, reference, words = views[i], views[i].image, "held-out image"
         if view.score_mask is not None:
             reference = over_white(reference, view.score_mask) * 0.5 + reference * 0.5
             words = "image, bleached where not scored"
         w, h = (max(8, round(FRACTION * side)) for side in (view.image.shape[1], view.image.shape[0]))
-        cells = []
-        for name, rendered in images.items():
-            value = scores[name].get(view.name)  # None if infinite
-            cells.append((rendered[i], "" if value is None else f"{value:.2f} dB"))
-        boxes = [(x, y, w, h) for x, y in crops(maps[i], w, h, CROPS)]
-        rows.append((f"{title}, {view.name}", [*cells, (reference, words)], boxes))
-    return rows
+        values = {n: scores[n].get(view.name) for n in images}  # None if infinite
+        labels = [*(n if v is None else f"{v:.2f} dB, {n}" for n, v in values.items()), words]
+        shown = [np.array(image, np.float32) for image in (*(rendered[i] for rendered in images.values()), reference)]
+        boxes = crops(maps[i], w, h, CROPS)
+        for image, ((x, y), color) in product(shown, zip(boxes, BOXES)):
+            cv2.rectangle(image, (x, y, w, h), color, max(1, w // 50))
+        tiles = [Tile(label, image) for label, image in zip(labels, shown)]
+        tiles += [Tile("enlarged", image[y : y + h, x : x + w]) for x, y in boxes for image in shown]
+        sheets.append(contact_sheet(f"{title}, {view.name}", [], tiles, columns=len(shown), tile_width=width))
+    return sheets
 
 
 SWITCHES = {
@@ -193,8 +202,8 @@ def _figure(request: StudyRequest, runs: Runs, places: Places, device: torch.dev
             folders = {v: run_folder(request, name, v, seed) for v in request.variants}
             found = {v: runs[name, v, seed][1] or {} for v in request.variants}
             scores = {v: {r["name"]: r["psnr"] for r in metrics["views"]} for v, metrics in found.items()}
-            rows += strips(name, train_views(scene, split.test), folders, scores, each, device)
-        return sheet([*request.variants, "image"], rows), f"the figure shows seed {seed}"
+            rows += view_sheets(name, train_views(scene, split.test), folders, scores, each, device)
+        return png(np.concatenate(rows)), f"the figure shows seed {seed}"
     return None, "no figure: no seed succeeded in every row"
 
 
