@@ -426,7 +426,7 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
     shown = show(scene, "--out", out)
     for code, word, words in (
         (2, "give show or export", ["priors"]), (2, "give show or export", ["priors", "draw"]),
-        (2, "--threads must be a number from 0", [*shown, "--threads", "-1"]),
+        (2, "--threads must be in [0, 4096]", [*shown, "--threads", "-1"]),
         (2, "depth-size was removed: give it in FILE.onnx.json", [*shown, "--depth-size", "64"]),
         (3, "not an ONNX model", [*shown, "--depth-model", str(file)]),
         (3, "cannot be read", [*shown, "--segmentation-model", str(tmp_path / "none.onnx")]),
