@@ -144,8 +144,8 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
         ("auto", {}, None),
         ("interpolate", {}, None),
         ("auto", {"size": (160, 32)}, None),
-        ("spiral", {"fov_y": 1.0}, "keep the shape and the field of view of the photographs"),
-        ("own", {}, "move the cameras nearer to the photographs' cameras"),
+        ("spiral", {"fov_y": 1.0}, "--path interpolate stays at the training views"),
+        ("own", {}, "move the cameras nearer to the photographs' cameras, or narrow their field of view"),
     ],
 )
 def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, advice):
@@ -157,13 +157,11 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
     else:
         plan = plan_film(model, path, FilmSettings(frames=2, **settings))
     notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings())[1] if "outside all photographs" in n]
-    ahead = film.foreseen(model, plan, FilmSettings())  # the same without the numbers, before the frames are rendered
-    assert len(notes) == len(ahead) == (advice is not None)
+    assert len(notes) == (advice is not None)
     if advice:
         frames = "1 of 2 frames have over 10% of their pixels outside all photographs (frames 1)"
         assert notes[0].startswith(frames if path == "own" else "2 of 2 frames")
-        assert notes[0].endswith(f"expect artefacts there; {advice}") and ahead[0].endswith(f"expect artefacts there; {advice}")
-        assert ahead[0].startswith("1 of 2 frames looked at" if path == "own" else "2 of 2 frames looked at")
+        assert notes[0].endswith(f"expect artefacts there; {advice}")
 
 
 def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):

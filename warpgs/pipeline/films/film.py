@@ -86,8 +86,8 @@ MIN_FRAMES_PER_VIEW = 4
 MAX_FRAMES = 1_000_000
 WIDER = 1.02
 """A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
-EMPTY_VIEW = "score each view with `warpgs eval`"
-"""Advice for training views that show nothing."""
+EMPTY_VIEW, MARKED = "score each view with `warpgs eval`", "--coverage marks these places"
+"""Advice for training views that show nothing, and for views of areas outside the photographs."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class FilmPlan:
     """Advice for frames that show nothing."""
     notes: list[str]
     """Lines for the user on the choices made."""
-    nearer: str = "move the cameras nearer to the photographs' cameras"
+    nearer: str = "move the cameras nearer to the photographs' cameras, or narrow their field of view"
     """Advice for frames that show areas outside the photographs."""
 
 
@@ -194,14 +194,12 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
             raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
         shown = [(names[n], paths.framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
-        nearer = _nearer([c for _, c in shown], train, "--coverage marks these places")
-        return FilmPlan(shown, coverage, EMPTY_VIEW, _cropped(train[0], settings), nearer)
+        return FilmPlan(shown, coverage, EMPTY_VIEW, _cropped(train[0], settings), MARKED)
     rig = paths.rig_of(train, depth, model.normalization.up)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
         remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
-        nearer = _nearer(cameras, train, "move the keyframes nearer to the photographs' cameras")
-        return FilmPlan(_numbered(cameras), coverage, remedy, [words], nearer)
+        return FilmPlan(_numbered(cameras), coverage, remedy, [words])
     notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe(train)}"]
     if rig.turned:
         notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
@@ -212,14 +210,14 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         cameras, words = _tour(rig, far if left_out else train, settings)
         words += f"; {left_out} close-ups are left out" * bool(left_out)
         words += "; --path turntable is calmer" * (path == "auto" and rig.kind == "forward")
-        remedy, nearer = EMPTY_VIEW, "--coverage marks these places"
+        remedy, nearer = EMPTY_VIEW, MARKED
     else:
         cameras = paths.camera_path(kind, rig, train, settings.count(SECONDS))
         words = f"path: {kind}" + ", there and back over the captured area" * (rig.span is not None and kind == "turntable")
         remedy = nearer = "--path interpolate stays at the training views"
     notes += _cropped(cameras[0], settings)
     cameras = [paths.framed(c, settings.size, settings.fov_y) for c in cameras]
-    return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], _nearer(cameras, train, nearer))
+    return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], nearer)
 
 
 def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
@@ -233,19 +231,6 @@ def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
         f"frames have another shape than the photographs, and show {min(zooms) / max(zooms):.0%} of their "
         f"{'height' if zooms[0] > zooms[1] else 'width'}; --fov {now:.0f} to {whole:.0f} shows more"
     ] * (max(zooms) > WIDER * min(zooms))
-
-
-def _nearer(cameras: Sequence[Camera], train: Sequence[Camera], path: str) -> str:
-    """Return advice for frames that show areas outside the photographs: on size if the film is wider, else ``path``."""
-    (wide, high), photo = _field(cameras[0]), [_field(c) for c in train]
-    if min(wide, high) > WIDER * min(map(min, photo)) or max(wide, high) > WIDER * max(map(max, photo)):
-        return "keep the shape and the field of view of the photographs"
-    return path
-
-
-def _field(camera: Camera) -> tuple[float, float]:
-    """Return width and height of what a camera sees, as fractions of the depth."""
-    return camera.width / float(camera.K[0, 0]), camera.height / float(camera.K[1, 1])
 
 
 def _numbered(cameras: list[Camera]) -> list[tuple[str, Camera]]:
@@ -299,14 +284,6 @@ def _frames(
             classes = classes_of(coverage_map(surface, camera, training)[0], (surface <= 0) & cut_out)
             covered = coverage_image(image, classes["0"], classes["1"])
         yield image, r.alpha.cpu().numpy(), fraction_outside(surface, camera, photographs, not model.transparent), covered
-
-
-def foreseen(model: FittedModel, plan: FilmPlan, settings: FilmSettings) -> list[str]:
-    """Return a line for the user if some frames of a film show areas outside all photographs, by a few small renders."""
-    every = max(1, len(plan.cameras) // SHEET_FRAMES)
-    few = [paths.framed(c, (c.width // 4, c.height // 4)) for _, c in plan.cameras[::every]]
-    count = sum(outside > OUTSIDE for _, _, outside, _ in _frames(model, few, settings, False))
-    return [f"{count} of {len(few)} frames looked at {ARE_OUTSIDE}: expect artefacts there; {plan.nearer}"] * bool(count)
 
 
 def render_film(

@@ -177,8 +177,6 @@ def render(
     told = not alone and any(p.is_file() for p in (out / film.FILM, *home.glob(f"path-*/{film.FILM}")))
     if one_size and not told and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
         say(VP9)
-    for line in film.foreseen(stored, plan, settings):
-        say(line)
     if coverage:
         try:
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
