@@ -281,7 +281,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 SAME = {
     "fingerprint": "the scene (its images, cameras, points or maps, or a flag that changes them, like --downscale)",
     "train": "the set of training views", "test": "the set of held-out views", "config": "config", "device": "device",
-    "own_code": "the code",
+    "own_code": "your own code",
 }  # fmt: skip
 """Parts of config.json that stay the same in a continued run, as text for the user."""
 
@@ -297,16 +297,10 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
         then = stored.get(key, {})
         if now == then:
             continue
-        if key == "own_code":
-            fix = "or the run did not record its version; restore the code, or give a new --out"
-            raise UsageError(f"--resume: the code of {', '.join(now or then)} has changed since the run in {out} began, {fix}")
         if isinstance(now, dict):
             words += f" ({', '.join(k for k in now | then if now.get(k) != then.get(k))})"
-        scene = record["scene"].items() if key != "device" else ()
-        was = [f"{k} was {stored['scene'].get(k)}" for k, v in scene if k != "path" and stored["scene"].get(k) != v]
-        were = f" ({', '.join(was)})" if was else ""
-        fix = f"give only --out {shlex.quote(str(out))} --resume; for other flags, give a new --out"
-        raise UsageError(f"--resume: {words} differs from the run in {out}{were}. To continue with the run's own flags, {fix}")
+        fix = f"give only --out {shlex.quote(str(out))} --resume; for other flags or code, give a new --out"
+        raise UsageError(f"--resume: {words} differs from the run in {out}. To continue with the run's own flags, {fix}")
 
 
 def _check_lost(stored: dict[str, Any], out: Path) -> None:
@@ -324,8 +318,6 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
         if key == "config" and isinstance(found, dict):
             found = upgraded(found)[0]
         if found != wanted:
-            if isinstance(found, dict) and isinstance(wanted, dict):
-                key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
             raise DataError(f"--resume: {key} differs between {out / TENSORS} and {CONFIG}; restore both, or fit again")
 
 
