@@ -27,7 +27,6 @@ from warpgs.pipeline.films.paths import Rig, midways, rig_among
 from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import Renders, baselines, psnr_of, score, summarize, variants
-from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.sampling import SampledView, Sampling
@@ -156,20 +155,14 @@ def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], 
 
 def _summary(r: dict[str, Any]) -> str:
     """Return the figures as one sentence for the user."""
-    sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
-    where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
-    error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
+    error = (
+        f"{r['mean']:.1e} on average, {r['max']:.1e} at most, {r['psnr']:.0f} dB, on parts of {len(r['views'])} training views"
+    )
     words = f"rule exact has the cut-offs of 3DGS (docs/conventions.md); within them, float32 differs from float64 by {error}"
     if r["rule"] != "exact":
-        ratio = r["render_ms"] / r["exact_ms"]
-        words = (
-            f"images by rule {r['rule']} differ from images by rule exact in float64 by {error}; a view took "
-            f"{r['render_ms']:.1f} ms, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'} than with rule exact "
-            f"({r['exact_ms']:.1f} ms)"
-        )
-    if r["half_resolution"] > 0:
-        words += f"; {r['half_resolution']:.0%} of the steps used views of half size, with a quarter of the pixels"
-    return words
+        words = f"images by rule {r['rule']} differ from images by rule exact in float64 by {error}; a view took "
+        words += f"{r['render_ms']:.1f} ms, and {r['exact_ms']:.1f} ms with rule exact"
+    return words + f"; {r['half_resolution']:.0%} of the steps used views of half size" * (r["half_resolution"] > 0)
 
 
 FOLDER = "sampling"
@@ -289,22 +282,14 @@ def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
     events, layers = figures["events"], figures["layers"]
     if not events["count"]:
         return None
-    how, after = "sampled uniformly at random", "All scores have weight 0, so no score is shown."
-    if strategy.scored:
-        how = "sampled at random in proportion to S_importance"
-        after = "S_importance is the weighted sum of the three scores; each score is shown below its source."
+    how = "sampled at random in proportion to S_importance" if strategy.scored else "sampled uniformly at random"
     if not strategy.at_random:
         how = "the highest in S_importance"
     depth = "consistent" if strategy.consistent else "rendered"
     words = (
         f"Each dot is a pixel behind which a fine Gaussian was added at the {depth} depth, while the layer had capacity. These "
-        f"pixels are {how}, among {_open_pixels(strategy, True, strategy.asked_quantile)} (the gate). {after}"
+        f"pixels are {how}, among {_open_pixels(strategy, True, strategy.asked_quantile)} (the gate)."
     )
-    if events["widened"]:
-        words += (
-            f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened, because fewer than "
-            f"{SUPPORT} candidates for each sample passed at the {strategy.asked_quantile:g} quantile."
-        )
     table = [
         ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],
         [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
