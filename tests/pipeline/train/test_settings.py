@@ -355,8 +355,8 @@ def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):
     config, notes = chosen(views, device, view, **given)
     assert {name: value(config, name) for name in wanted} == wanted
     if not given:
-        assert ("one layer" in notes) != config.method.hier and ("no extrapolated points" in notes) != config.init.extrapolate
-        assert ("mean of the last 5% of the steps" in notes) == (config.optimizer.average_last > 0)
+        assert f"method.hier {config.method.hier}" in notes and f"init.extrapolate {config.init.extrapolate}" in notes
+        assert f"optimizer.average-last {config.optimizer.average_last}" in notes
     smooth = ["smooth_depth"] * (config.loss.smooth_weight > 0)
     assert [t.name for t in built_in_terms(config.loss)] == ["photometric", *smooth]
 
