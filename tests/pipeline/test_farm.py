@@ -258,8 +258,8 @@ def test_a_job_as_text_is_the_same_job(scenes, tmp_path, monkeypatch):
     for name, value in (torch | {"get_num_threads": 8}).items():
         monkeypatch.setattr(f"torch.{name}", lambda *_, value=value: value)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
-    with pytest.raises(UsageError, match="--slots and --per-gpu must be numbers from 1"):
-        local_slots("cuda", 0, 2)
+    with pytest.raises(UsageError, match="2 GPUs with --per-gpu 2 have 4; give more"):
+        local_slots("cuda", 5, 2)
     assert local_slots("cuda", None, 2) == [("cuda", 2, {"CUDA_VISIBLE_DEVICES": n}) for n in "3535"]
 
 

@@ -14,7 +14,7 @@ from warpgs.errors import UsageError
 from warpgs.io.image_files import MAX_PIXELS
 from warpgs.process import say, say_lines
 from warpgs.report.progress import Stages, waiting
-from warpgs.schema import Within
+from warpgs.schema import Checked, Within
 
 Side = Annotated[int, Within(32, 8192)]
 """Side of a synthetic image [px]."""
@@ -402,7 +402,7 @@ def study_flags() -> type:
     reading, unread = scene_flags(positional=False)
 
     @dataclass(frozen=True, kw_only=True)
-    class Study:
+    class Study(Checked, group="--"):
         scenes: Positional[tuple[Path, ...]]
         """Scene folders."""
         out: Path
@@ -413,10 +413,10 @@ def study_flags() -> type:
         """Optimisation steps of every run. Default: as in `warpgs fit`."""
         device: str = "auto"
         """auto, cpu or cuda."""
-        slots: int | None = None
+        slots: Annotated[int | None, Within(1)] = None
         """Number of concurrent runs, each in its own process. If neither --slots nor --per-gpu is given, runs follow each other
         in one process."""
-        per_gpu: int | None = None
+        per_gpu: Annotated[int | None, Within(1)] = None
         """Runs that share a GPU."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import say, say_lines
 from warpgs.report.images import Tile, contact_sheet, crops, disagreement, png
 from warpgs.scene import Scene, View
+from warpgs.schema import Checked, Within
 
 CROPS = 2
 """Enlarged parts of each view."""
@@ -96,14 +97,14 @@ FILES = ("table.md", "table.csv", "table.tex", "runs.csv", "plot.svg", "figure.p
 
 
 @dataclass(frozen=True)
-class StudyRequest:
+class StudyRequest(Checked, group="--"):
     """A comparison: settings, scenes and seeds."""
 
     scenes: tuple[SceneRequest, ...]
     """Scenes that every variant is fitted to."""
     variants: dict[str, FitConfig]
     """Settings by name; each is compared with the first one. The study sets the seed."""
-    seeds: int
+    seeds: Annotated[int, Within(1, MAX_SEEDS)]
     """Number of runs of each variant on each scene, with seeds from 0 on."""
     out: Path
     """Folder of the study; its runs are in SCENE/VARIANT/SEED."""
@@ -117,8 +118,7 @@ class StudyRequest:
     """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.seeds <= MAX_SEEDS:
-            raise UsageError(f"--seeds must be a number from 1 to {MAX_SEEDS}, not {self.seeds}")
+        super().__post_init__()
         if len(self.variants) < 2:
             raise UsageError(f"a comparison needs at least two settings, not {', '.join(self.variants) or 'none'}")
         if not (names := [scene_name(s) for s in self.scenes]):
@@ -385,24 +385,22 @@ def _run_all(request: StudyRequest, places: Places, device: torch.device, lpips:
         farmed = dict(zip(fits, run_and_show(jobs, make_engine(request.device, **request.engine), request.out)))
     for key, ((_, scene, split), fit) in fits.items():
         record = farmed[key].record if farmed else None
-        if record is None:
-            say(f"[{len(runs) + 1}/{len(fits)}] {key[0]}, {key[1]}, seed {key[2]}")
-        elif record.state == "failed":
+        if record is not None and record.state == "failed":
             runs[key] = "failed", None, record.message
             continue
+        say(f"[{len(runs) + 1}/{len(fits)}] {key[0]}, {key[1]}, seed {key[2]}")
         resolved, _ = settings_by_views(fit.config, train_views(scene, split.train), device.type)
         try:
             outcome = ensure_run(fit, scene.fingerprint, split, device.type, lpips, resolved, verbose="progress")
         except WarpgsError as e:
             outcome = "failed", None, "; then ".join([*getattr(e, "__notes__", ()), str(e)])
         state, metrics, note = outcome
-        if record is None:
-            if state != "fitted":
-                say(f"  {state}{': ' if note else ''}{note}")
-            if metrics is not None:
-                say(f"  {summary_line(metrics)}")
-        elif state == "kept":
+        if record is not None and state == "kept":
             outcome = record.how, metrics, record.message
+        elif state != "fitted":
+            say(f"  {state}{': ' if note else ''}{note}")
+        if metrics is not None:
+            say(f"  {summary_line(metrics)}")
         runs[key] = outcome
         gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory is not freed
     return runs
