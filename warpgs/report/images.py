@@ -122,18 +122,13 @@ def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple
     total = np.zeros((H + 1, W + 1))
     total[1:, 1:] = values.astype(np.float64).cumsum(0).cumsum(1)
     sums = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
-    found: list[tuple[int, int]] = []
     if not sums.max() > 1e-9:
-        found.append(((W - width) // 2, (H - height) // 2))
-    ys, xs = np.mgrid[: sums.shape[0], : sums.shape[1]]
-    while len(found) < count:
-        free = np.ones(sums.shape, bool)
-        for x, y in found:
-            free &= (np.abs(xs - x) >= width) | (np.abs(ys - y) >= height)
-        if not free.any():
-            break
-        at = int(np.argmax(np.where(free, sums, -1.0)))
-        found.append((int(xs.flat[at]), int(ys.flat[at])))
+        sums[(H - height) // 2, (W - width) // 2] = 1
+    found: list[tuple[int, int]] = []
+    while len(found) < count and sums.max() >= 0:
+        y, x = map(int, np.unravel_index(sums.argmax(), sums.shape))
+        found.append((x, y))
+        sums[max(0, y - height + 1) : y + height, max(0, x - width + 1) : x + width] = -1
     return found
 
 

@@ -72,13 +72,6 @@ def ticks(low: float, high: float) -> list[float]:
     return [i * step for i in range(first, first + 8) if i * step <= high + 1e-9 * step]
 
 
-def tick_label(value: float) -> str:
-    """Return a number as written on axes: 20000 becomes 20k."""
-    if abs(value) >= 1e6:
-        return f"{value / 1e6:g}M"
-    return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:g}"
-
-
 def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
     """Return an SVG chart of finite ``ys`` over ``xs``, as means of at most 300 groups; "no data" without any."""
     points = [(x, y) for x, y in zip(xs, ys) if math.isfinite(x) and math.isfinite(y)]
@@ -101,9 +94,9 @@ def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
     for tick in ticks(y0, y1):
         _, py = place(x0, tick)
         head += f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py:.1f}" y2="{py:.1f}"/>'
-        head += f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>'
+        head += f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick:g}</text>'
     for tick in ticks(x0, x1):
-        head += f'<text x="{place(tick, y0)[0]:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick_label(tick)}</text>'
+        head += f'<text x="{place(tick, y0)[0]:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick:g}</text>'
     line = " ".join(f"{px:.1f},{py:.1f}" for px, py in (place(*p) for p in points))
     return f'{head}<polyline class="line" points="{line}"/></svg>'
 

@@ -31,7 +31,7 @@ from warpgs.pipeline.metrics.scores import Renders, counted_region, psnr, render
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.clean import chosen_reasons, counted_lines, in_colors, reasons_of
 from warpgs.pipeline.model.edit import coverage
-from warpgs.pipeline.model.start import InitConfig, consistent_depths, seen_points
+from warpgs.pipeline.model.start import InitConfig, consistent_depths, isotropic, seen_points
 from warpgs.pipeline.model.table import FittedModel, model_bytes, pack
 from warpgs.pipeline.paper.scores import CURVATURE, geometry_score, semantic_score
 from warpgs.pipeline.run.folder import CONFIG, IMAGE_FOLDERS, StoredRun, camera_values, open_run, save_checkpoint, with_cameras
@@ -366,9 +366,7 @@ def _points(cloud: PointCloud, device: torch.device) -> Gaussians:
     low, high = np.percentile(cloud.points, [5, 95], axis=0)
     size = POINT_SIZE * max(float(np.linalg.norm(high - low)), 1e-6)
     means, colors = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (cloud.points, cloud.colors))
-    quats = torch.nn.functional.pad(means.new_ones(len(means), 1), (0, 3))
-    scales, opacities = torch.full_like(means, math.log(size)), means.new_full((len(means),), 6.0)
-    return Gaussians(means, quats, scales, opacities, base_coefficients(colors)[:, None])
+    return isotropic(means, colors, means.new_full((len(means),), math.log(size)), means.new_full((len(means),), 6.0), 1)
 
 
 def _by_coverage(gaussians: Gaussians, train: list[Camera], options: RasterizeOptions) -> Gaussians:

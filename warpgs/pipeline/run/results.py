@@ -40,7 +40,7 @@ from warpgs.report.images import Tile, contact_sheet, depth_map, error_map, png,
 from warpgs.report.overview import render_overview
 from warpgs.report.page import Section, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
-from warpgs.scene import Camera, Gaussians, Scene, View
+from warpgs.scene import Camera, Gaussians, Render, Scene, View
 
 GIVEN = {
     "given_depth": ("depth", "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})"),
@@ -97,15 +97,11 @@ def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, i
     return x, y, min(SIDE, camera.width - x), min(SIDE, camera.height - y)
 
 
-def _milliseconds(render: Callable[[], object], device: torch.device) -> float:
+def _milliseconds(render: Callable[[], Render]) -> float:
     """Return the wall time of the second of two calls [ms]: the first loads kernels and allocates."""
     for _ in range(2):
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
         began = time.perf_counter()
-        render()
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
+        render().rgb.sum().item()  # waits for the device
     return 1000 * (time.perf_counter() - began)
 
 
@@ -117,7 +113,7 @@ def rule_report_of(
     # Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule
     # `exact` in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if
     # `warpgs.geometry` does not have the camera model.
-    generator, device = np.random.default_rng(seed), gaussians.means.device
+    generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
     assert options.background is not None
     options = replace(options, background=options.background.to(gaussians.means))
@@ -133,10 +129,10 @@ def rule_report_of(
     result = {
         "rule": options.rule, "max": float(error.max()), "mean": float(error.mean()), "psnr": psnr_of(float((error**2).mean())),
         "views": {n: list(w) for n, w in windows.items()}, "half_resolution": half_resolution,
-        "render_ms": _milliseconds(lambda: rasterize(gaussians, camera, options), device),
+        "render_ms": _milliseconds(lambda: rasterize(gaussians, camera, options)),
     }  # fmt: skip
     if options.rule != "exact":
-        result["exact_ms"] = _milliseconds(lambda: rasterize(gaussians, camera, exact), device)
+        result["exact_ms"] = _milliseconds(lambda: rasterize(gaussians, camera, exact))
     return result | {"summary": _summary(result)}
 
 
