@@ -349,9 +349,11 @@ def test_coefficients_above_the_degree_vanish_and_what_disturbs_is_counted_once(
     made.log_scales[3] = torch.tensor([-4.0, -9.0, -9.0])  # a short one, which stays
     maxima = torch.ones(100)
     maxima[0] = 0
-    found = {reason: where.nonzero()[:, 0].tolist() for reason, where in edit.disturbing(made, maxima).items()}
+    found = {
+        reason: where.nonzero()[:, 0].tolist() for reason, where in edit.first_reasons(edit.floaters(made, maxima)).items()
+    }
     assert list(found.values()) == [[0], [1], [2]]
-    assert list(edit.disturbing(made)) == ["larger than the scene", "needles over 30 times as long as wide"]
+    assert list(edit.floaters(made)) == ["larger than the scene", "needles over 30 times as long as wide"]
 
 
 def test_a_clean_up_names_each_outlier():

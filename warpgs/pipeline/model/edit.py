@@ -184,11 +184,6 @@ def floaters(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[s
     return reasons
 
 
-def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Return the `floaters`, each under its first reason alone."""
-    return first_reasons(floaters(gaussians, maxima))
-
-
 def first_reasons(reasons: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Return masks [N] in which each Gaussian has only the first of its reasons."""
     masks = list(reasons.values())
