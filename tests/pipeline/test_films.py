@@ -66,7 +66,7 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         (lambda k: [{**k, "c2w": (1e200 * np.ones((4, 4))).tolist()}], "keyframe 0 must be a rigid"),
         (lambda k: [{**k, "c2w": [[1, 0], [0, 1]]}], "c2w"),
         (lambda k: [{**k, "c2w": [[math.nan] * 4] * 4}], "c2w"),
-        (lambda k: [{**k, "fov_y": 50}], "give radians"),
+        (lambda k: [{**k, "fov_y": 50}], "fov_y"),
         (lambda k: [{**k, "fov_y": 0}], "fov_y"),
         (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 s after the last"),
         (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 must be 0.001 to 86400"),

@@ -431,8 +431,7 @@ def run_study_of(a: Any, variants: dict, marks: dict) -> list[str]:
     from warpgs.pipeline.study.study import StudyRequest, run_study
 
     scenes = tuple(scene_of(a.reading, str(s)) for s in a.scenes)
-    apart = a.slots is not None or a.per_gpu is not None
-    engine = {"slots": a.slots, "per_gpu": 1 if a.per_gpu is None else a.per_gpu} if apart else None
+    engine = {n: v for n in ("slots", "per_gpu") if (v := getattr(a, n)) is not None} or None
     return run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, engine, marks))
 
 

@@ -18,7 +18,6 @@ from warpgs.process import Say, counted, fast_imports, hidden_stderr, printable,
 from warpgs.report.progress import Stages, waiting
 
 OK, MISSING, NOTE = "ok", "missing", "note"
-PYTHON = ((3, 11), (3, 14))  # lowest version, and the first one that is too new
 LOW_DISK = 2 * 2**30  # [bytes]; a run folder with checkpoints and a video fits well into this
 LOW_MEMORY = 4 * 2**30  # [bytes]
 
@@ -70,10 +69,7 @@ def _noted(topic: str, sound: bool, detail: str, remedy: str) -> Finding:
 
 
 def _python() -> Iterable[Finding]:
-    detail, (low, high) = f"{platform.python_version()} at {sys.executable}", PYTHON
-    sound, span = low <= sys.version_info[:2] < high, f">={low[0]}.{low[1]}, <{high[0]}.{high[1]}"
-    remedy = "" if sound else f"create an environment with Python {span}"
-    yield Finding("Python", OK if sound else MISSING, detail, remedy)
+    yield Finding("Python", OK, f"{platform.python_version()} at {sys.executable}")
     yield Finding("System", OK, f"{platform.system()} {platform.release()} on {platform.machine()}")
 
 

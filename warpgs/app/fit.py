@@ -4,7 +4,6 @@ import dataclasses
 import inspect
 import itertools
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -127,22 +126,14 @@ def _choices() -> str:
     return "\n\n".join(flags.listed(title, kind.described()) for title, kind in kinds.items())
 
 
-def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:
-    """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
-    )  # fmt: skip
-
-
 def _names(parts: Parts) -> Any:
     """Return the rule of a flag that names parts of a registry; their settings are flags of their own."""
-    return _read_by("NAME,...", lambda _: tuple(parts.values()), tuple, lambda v: ",".join(t.name for t in v) or "none")
+    return flags.read_by("NAME,...", lambda _: tuple(parts.values()), tuple, lambda v: ",".join(t.name for t in v) or "none")
 
 
 def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
-    size = _read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
+    size = flags.read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
     special = {
         "memory_limit": (size,), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
         "priors": (tyro.conf.OmitArgPrefixes,), "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),

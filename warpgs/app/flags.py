@@ -42,6 +42,14 @@ def call(command: Callable[..., Any], arguments: list[str], program: str, descri
     return parse_flags(later, arguments, program, description)()
 
 
+def read_by(metavar: str, read: Callable[[str], Any], kind: Any, text: Callable[[Any], str]) -> Any:
+    """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
+    )  # fmt: skip
+
+
 def _open_value(info: Any) -> Any:
     """Return tyro's rule for a number or switch that may be None, which takes none, true and false in any case."""
     kinds = typing.get_args(info.type)
@@ -50,15 +58,13 @@ def _open_value(info: Any) -> Any:
         return None
     words = {"none": None} | ({"true": True, "false": False} if kind is bool else {})
 
-    def read(given: list[str]) -> Any:
-        if given[0].lower() not in words and kind is bool:
-            raise ValueError(f"expected true, false or none, got {given[0]!r}")
-        return words[given[0].lower()] if given[0].lower() in words else kind(given[0])
+    def read(word: str) -> Any:
+        if word.lower() not in words and kind is bool:
+            raise ValueError(f"expected true, false or none, got {word!r}")
+        return words[word.lower()] if word.lower() in words else kind(word)
 
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar="|".join([*words, *([] if kind is bool else [kind.__name__.upper()])]), instance_from_str=read,
-        is_instance=lambda value: value is None or isinstance(value, (int, kind)), str_from_instance=lambda v: [str(v).lower()],
-    )  # fmt: skip
+    metavar = "|".join([*words, *([] if kind is bool else [kind.__name__.upper()])])
+    return read_by(metavar, read, (int, kind), lambda value: str(value).lower())
 
 
 def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:

@@ -409,7 +409,8 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
 
 
 KEYFRAMES = schema.items(schema.fields({
-    "c2w": schema.items(schema.items(schema.number(), 4), 4), "fov_y": schema.number(0.01), "seconds": schema.number(0.0),
+    "c2w": schema.items(schema.items(schema.number(), 4), 4),
+    "fov_y": schema.number(0.01, high=3.1), "seconds": schema.number(0.0),
 }))  # fmt: skip
 
 
@@ -433,8 +434,6 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         if not rigid or np.abs(matrix[:3, 3]).max() > MAX_REACH:
             fix = f"its upper left 3 x 3 a rotation, its last column within {MAX_REACH:g}, and its last row 0 0 0 1"
             raise DataError(f"{path}: c2w of keyframe {i} must be a rigid camera-to-world matrix: {fix}")
-        if value["fov_y"] > 3.1:
-            raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
             raise DataError(f"{path}: keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} s after the last; sort by time")
         viewmat = geometry.pose_at(geometry.nearest_rotation(rotation).T, matrix[:3, 3])

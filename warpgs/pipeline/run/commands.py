@@ -142,10 +142,8 @@ def evaluate(
     if not test:
         return [*lines, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB{over_region(metrics)}"]
     for row in metrics["views"]:
-        kinds = {"alpha_empty": "where empty", "alpha_object": "in the object"}
-        alphas = [f", alpha {row[k]:.3f} {words}" for k, words in kinds.items() if not math.isnan(row.get(k, math.nan))]
         region = "" if row["region"] == "all" else f" (over {row['region']})"
-        lines.append(f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}{''.join(alphas)}{region}")
+        lines.append(f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}{region}")
     lines += coverage_lines(metrics["coverage"]) if by_coverage else []
     return [*lines, f"mean of {len(test)} held-out views: {score_line(metrics['test'])}"]
 

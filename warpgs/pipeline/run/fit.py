@@ -31,7 +31,7 @@ from warpgs.pipeline.run import folder as folders, results
 from warpgs.pipeline.run.folder import CONFIG, METRICS_FILE, POSED_SCENE, TENSORS
 from warpgs.pipeline.run.precompile import compiled_ahead
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
-from warpgs.pipeline.train.batch import check_ranks, own_slots
+from warpgs.pipeline.train.batch import check_ranks
 from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.memory import plan_summary
 from warpgs.pipeline.train.presets import chosen_settings
@@ -252,9 +252,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     """Return sentences on views and processes of a step; empty if a step has one view."""
     rates = f"learning rates are {config.batch**0.5:.3g} times those for one view"
     views = f"batch: each of the {config.steps:,} steps renders {config.batch} views and averages their gradients; {rates}"
-    counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
-    each = f"each renders {' or '.join(map(str, counts))} views of a step; the model has the same bits for any number of ranks"
-    processes = f"ranks: {ranks.count} processes ({ranks.backend}); {each}"
+    processes = f"ranks: {ranks.count} processes ({ranks.backend}) share the views; the model has the same bits for any number"
     return [views] * (config.batch > 1) + [processes] * (ranks.count > 1)
 
 

@@ -200,16 +200,10 @@ def view_sheet(
         Tile("sampled pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
         *(Tile(n, score) for n, score in scores.items()),
     ]
-    asked = strategy.asked_quantile
-    widened = f"; too few passed at the {asked:g} quantile" if sampled.quantile < asked else ""
     lines = [
         f"{len(at):,} pixels sampled of the {gate.sum():,} that pass the gate, {gate.mean():.0%} of the view.",
-        f"Gate: {_open_pixels(strategy, view.consistent is not None, sampled.quantile)}{widened}.",
+        f"Gate: {_open_pixels(strategy, view.consistent is not None, sampled.quantile)}.",
     ]
-    if scores:
-        score = [*scores.values()][-1]
-        mean = score[at[:, 0], at[:, 1]].mean() if len(at) else 0
-        lines.append(f"Mean importance: {mean:.2f} at the sampled pixels, {score.mean():.2f} over the view.")
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
