@@ -69,16 +69,13 @@ class Rig:
     turned: bool
     """True if the photographs are rotated by a quarter turn, so that an upright film swaps width and height."""
 
-    def describe(self, cameras: list[Camera]) -> str:
+    def describe(self) -> str:
         """Return a phrase on the positions of the rig's cameras."""
         words = NAMES[self.kind]
         if self.span is None:
             return f"{words}, from all sides" if self.kind == "ring" else words
-        if self.kind == "forward":  # azimuths of cameras above each other are equal; the centre may be behind the subject
-            ways = np.array([[_unit(c.center - self.center) for c in cameras], [c.viewmat[2, :3] for c in cameras]])
-            widest = math.acos(np.clip((ways[:, :, None] * ways[:, None]).sum(-1).min(), -1, 1))
-            return f"{words}, over {math.degrees(widest):.0f} degrees"
-        return words if self.kind == "free" else f"{words}, over {math.degrees(self.span[1] - self.span[0]):.0f} of 360 degrees"
+        over = f", over {math.degrees(self.span[1] - self.span[0]):.0f} of 360 degrees"
+        return words + over * (self.kind in ("ring", "room"))
 
     def direction(self, azimuth: float, elevation: float) -> np.ndarray:
         """Return the unit vector [3] at an azimuth and an elevation [rad]."""
