@@ -277,7 +277,7 @@ def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, 
     rows = list(csv.DictReader(table.splitlines()))
     assert [(r["name"], r["state"], r["steps"]) for r in rows] == [("a", "done", "2"), ("b & c", "failed", "0")]
     assert str(tmp_path) in rows[1]["message"] and str(tmp_path) not in page  # a page is sent, and tells of no folder
-    assert "<b>b &amp; c</b>" in page and 'src="a/thumbnail.jpg"' in page and "Failures" in page
+    assert "<b>b &amp; c</b>" in page and 'src="a/thumbnail.webp"' in page and "Failures" in page
     assert json.loads((tmp_path / "out" / "a" / "run" / "config.json").read_text())["config"]["seed"] == 3
     assert main(["farm", str(jobs), "--out", str(tmp_path / "out"), "--resume"]) == 2
     assert "--resume is not supported by farm" in capsys.readouterr().err
