@@ -28,13 +28,15 @@ def image_names(views: Iterable[str]) -> dict[str, str]:
     # ambiguous, longer than 100 bytes or not allowed on some system is shortened; digits of a hash of the whole name follow.
     own = {view: _own_name(view) for view in views}
     count = Counter(map(_folded, own.values()))
-    kept = {v: n for v, n in own.items() if count[_folded(n)] == 1 and not NOT_EVERYWHERE.search(n) and _size(n) <= MOST_BYTES}
-    for view, name in own.items():
-        if view in kept:
-            continue
+
+    def named(view: str, name: str) -> str:
+        size = len(name.encode("utf-8", "surrogatepass"))
+        if count[_folded(name)] == 1 and not NOT_EVERYWHERE.search(name) and size <= MOST_BYTES:
+            return name
         part = re.sub(r"[^\w.-]", "_", name).lstrip(".").encode("utf-8", "replace")[: MOST_BYTES // 2].decode("utf-8", "ignore")
-        kept[view] = f"{part}-{hashlib.sha256(view.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
-    return {view: kept[view] for view in own}
+        return f"{part}-{hashlib.sha256(view.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
+
+    return {view: named(view, name) for view, name in own.items()}
 
 
 def renaming_notes(names: dict[str, str]) -> list[str]:
@@ -52,10 +54,6 @@ def _own_name(view: str) -> str:
 def _folded(name: str) -> str:
     """Return a key that is equal for names that a file system may confuse: macOS and Windows ignore capitals."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
-
-
-def _size(name: str) -> int:
-    return len(name.encode("utf-8", "surrogatepass"))
 
 
 WIDTH, HEIGHT = 380, 190
