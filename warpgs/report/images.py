@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from warpgs.errors import ResourceError
-
 GRAY = (0.5, 0.5, 0.5)
 PAGE_WIDTH = 1280
 """Largest width of an image on a page [px]: a page shows it at about half this width, and phone screens have two device pixels
@@ -26,10 +24,7 @@ def png(image: np.ndarray) -> bytes:
 def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> bytes:
     import cv2
 
-    done, data = cv2.imencode(suffix, pixels, options)
-    if not done:
-        raise ResourceError(f"an image of {pixels.shape[1]} x {pixels.shape[0]} px could not be encoded as {suffix}")
-    return data.tobytes()
+    return cv2.imencode(suffix, pixels, options)[1].tobytes()
 
 
 def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) -> bytes:
@@ -157,7 +152,6 @@ def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> n
 CONTACT_PAPER, CONTACT_INK, CONTACT_SOFT, CONTACT_LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
 LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
 CONTACT_MARGIN, CONTACT_GAP, CONTACT_HEAD = 28, 18, 30  # [px]; HEAD is the height of a label
-CONTACT_LEGEND = (72, 8)  # width and height of a colour bar [px]
 DOT = (240, 78, 35)
 """Colour of dots."""
 MAX_DOT_FRACTION = 0.08
@@ -171,11 +165,9 @@ class Tile:
     label: str
     """Name of the content, in a few words."""
     values: np.ndarray
-    """Colours [H, W, 3] in [0, 1], or values [H, W]."""
+    """Colours [H, W, 3], or values [H, W], both in [0, 1]."""
     colors: str = "INFERNO"
     """Colour map of values."""
-    largest: float = 1.0
-    """Value of the last colour of the map; the first is 0."""
     dots: np.ndarray | None = None
     """Rows and columns of pixels to mark, shape [S, 2]."""
 
@@ -184,7 +176,7 @@ def _tile_image(tile: Tile, size: tuple[int, int]):
     """Return a tile's pixels at a size (width, height) [px], as a Pillow image."""
     values = tile.values
     if values.ndim == 2:
-        values = colored(values / tile.largest, tile.colors)
+        values = colored(values, tile.colors)
     image = resized(values, *size)
     return image if tile.dots is None else _dotted(image, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
 
@@ -205,7 +197,7 @@ def _dotted(image, centers: np.ndarray):
 def contact_sheet(
     title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
 ) -> np.ndarray:
-    """Arrange labelled tiles of one size in rows, with colour bars of maps and lines of text; colours [rows, columns, 3]."""
+    """Arrange labelled tiles of one size in rows, with lines of text; colours [rows, columns, 3]."""
     height, width = tiles[0].values.shape[:2]
     tile_height = max(1, round(tile_width * height / width))
     cells = len(tiles) + bool(lines)
@@ -231,12 +223,4 @@ def contact_sheet(
         label = tile.label[: int(tile_width / (0.5 * label_size))]
         draw.text((x, y + head // 5), label, CONTACT_INK, fonts[label_size])
         sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + head))
-        if tile.values.ndim == 2:
-            middle, right = y + head // 2, x + tile_width
-            largest, small = f"{tile.largest:g}", fonts[text_size]
-            values = np.linspace(0, 1, CONTACT_LEGEND[0], dtype=np.float32)[None].repeat(CONTACT_LEGEND[1], 0)
-            left = right - round(draw.textlength(largest, small)) - 6 - CONTACT_LEGEND[0]
-            draw.text((right, middle), largest, CONTACT_SOFT, small, anchor="rm")
-            sheet.paste(_tile_image(Tile("", values, tile.colors), CONTACT_LEGEND), (left, middle - CONTACT_LEGEND[1] // 2))
-            draw.text((left - 6, middle), "0", CONTACT_SOFT, small, anchor="rm")
     return np.asarray(sheet, np.float32) / 255
