@@ -239,7 +239,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "no such folder" in failure(capsys, 3, "fit", str(tmp_path / "nowhere"), "--out", str(tmp_path / "b"))
     assert "no view 'x.png'" in failure(capsys, 3, "fit", str(scene), "--out", str(tmp_path / "c"), "--split", "train=x.png")
     assert "not understood" in failure(capsys, 2, "fit", str(scene), "--out", str(tmp_path / "d"), "--split", "third:3")
-    assert "holds no run" in failure(capsys, 3, "eval", str(tmp_path))
+    assert "not the folder of a run (config.json" in failure(capsys, 3, "eval", str(tmp_path))
     assert "no such folder" in failure(capsys, 3, "eval", str(tmp_path / "nowhere"))
     assert "no such file or folder; give a run" in failure(capsys, 3, "view", str(tmp_path / "nowhere"))
     (tmp_path / "my-run").mkdir()
@@ -249,7 +249,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     said = failure(capsys, 2, "convert", str(run), "a b.ply")
     assert f"is a run; use `warpgs export {run} --to 'a b.ply'`" in said
     (tmp_path / "model.spz").touch()
-    assert "model.spz: is a file, not the folder of a run" in failure(capsys, 3, "eval", str(tmp_path / "model.spz"))
+    assert "model.spz: not the folder of a run" in failure(capsys, 3, "eval", str(tmp_path / "model.spz"))
     again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]
     assert "a flag that changes them, like --downscale) differs from the run" in (said := failure(capsys, 2, *again))
     assert f"give only --out {run} --resume" in said

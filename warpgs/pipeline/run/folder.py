@@ -248,10 +248,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         record = schema.read(path, folder)
     except (FileNotFoundError, NotADirectoryError) as e:
-        lack, near = f"holds no run ({CONFIG} is missing)", ""
-        if not folder.is_dir():
-            lack = "is a file, not the folder of a run" if folder.is_file() else "no such folder"
-            near = similar_folder(folder)
+        lack = f"not the folder of a run ({CONFIG} is missing)" if folder.exists() else "no such folder"
+        near = similar_folder(folder) if not folder.exists() else ""
         raise DataError(f"{folder}: {lack}; {near or 'give a folder that `warpgs fit --out` filled'}") from e
     except (OSError, SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e

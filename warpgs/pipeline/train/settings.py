@@ -471,10 +471,7 @@ def _unknown(name: str, config: FitConfig, keywords: bool) -> str:
         return note
     if name in groups:
         return f"{name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
-    last = [k for k, n in known.items() if n.rpartition(".")[2] == name.rpartition(".")[2]]  # `opacity` for `init.opacity`
-    if "." in name:  # `other.every` for `mcmc.every`, but only if `other` is not similar to a group
-        own = {n for n, (path, _) in _leaves(config).items() if path[0] in ("strategy_config", *PARTS)}
-        last = [k for k in last if known[k] in own and not did_you_mean(name.partition(".")[0], groups)]
+    last = [k for k, n in known.items() if n.rpartition(".")[2] == name]  # `opacity` for `init.opacity`
     hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
     return f"unknown setting {name[:60]!r}; {hint}"
 
