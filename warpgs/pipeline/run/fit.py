@@ -201,12 +201,11 @@ def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) 
     own = [t.name for t in trainer.terms if f"the loss term {t.name}" in broken and not is_ours(type(t))]
     text = f"{error}, on {job.split.train[view]}{', in ' if broken else ''}{' and '.join(broken)}; "
     text += f"not finite: {', '.join(tensors)}" if tensors else "all of its inputs and renders are finite"
-    fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
-    report = "" if own else "; if that fails, report this message"
     if job.out is not None:
         text += f". The state before the step is saved in {job.out}, and --resume would fail at the same step"
-        fix, report = f"{fix} into a new --out", report and f"{report} and {job.out / CONFIG}"
-    return NotFiniteError(f"{text}. To fix it, {fix}{report}")
+    fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
+    report = "" if own else f"; if that fails, report this message and the run's {CONFIG}"
+    return NotFiniteError(f"{text}. To fix it, {fix} into a new --out{report}")
 
 
 def non_finite_parts(trainer: Trainer, view: int, slot: int) -> tuple[list[str], list[str]]:

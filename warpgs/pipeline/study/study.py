@@ -20,7 +20,7 @@ from warpgs.pipeline.farm.farm import make_engine, run_and_show
 from warpgs.pipeline.farm.job import PLY, FarmJob
 from warpgs.pipeline.farm.work import Outcome, ensure_run
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import over_white, render_view
+from warpgs.pipeline.metrics.scores import render_view
 from warpgs.pipeline.paper.strategy import UNIFORM, PaperConfig
 from warpgs.pipeline.run.folder import open_run, versions
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device, read_scene
@@ -66,14 +66,11 @@ def view_sheets(
         maps.append(values if view.score_mask is None else values * view.score_mask)
     sheets, width = [], max(CELL[0], min(CELL[1], MAX_WIDTH // (len(images) + 1)))
     for i in sorted(sorted(range(len(views)), key=lambda i: -float(maps[i].mean()))[:count]):
-        view, reference, words = views[i], views[i].image, "held-out image"
-        if view.score_mask is not None:
-            reference = over_white(reference, view.score_mask) * 0.5 + reference * 0.5
-            words = "image, bleached where not scored"
+        view = views[i]
         w, h = (max(8, round(FRACTION * side)) for side in (view.image.shape[1], view.image.shape[0]))
         values = {n: scores[n].get(view.name) for n in images}  # None if infinite
-        labels = [*(n if v is None else f"{v:.2f} dB, {n}" for n, v in values.items()), words]
-        shown = [np.array(image, np.float32) for image in (*(rendered[i] for rendered in images.values()), reference)]
+        labels = [*(n if v is None else f"{v:.2f} dB, {n}" for n, v in values.items()), "held-out image"]
+        shown = [np.array(image, np.float32) for image in (*(rendered[i] for rendered in images.values()), view.image)]
         boxes = crops(maps[i], w, h, CROPS)
         for image, ((x, y), color) in product(shown, zip(boxes, BOXES)):
             cv2.rectangle(image, (x, y, w, h), color, max(1, w // 50))
