@@ -102,14 +102,6 @@ def frame_sheet(frames: list[np.ndarray], columns: int = 3, gap: int = 4) -> np.
     return side_by_side([row.swapaxes(0, 1) for row in rows], gap).swapaxes(0, 1)
 
 
-def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
-    """Return the range of images [H, W, 3], mean over channels, [H, W]; of one image, its error to ``reference``."""
-    if len(images) == 1:
-        return np.abs(images[0] - reference).mean(-1)
-    stack = np.stack(images)
-    return (stack.max(0) - stack.min(0)).mean(-1)
-
-
 def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple[int, int]]:
     """Return corners (x, y) [px] of up to ``count`` disjoint crops with the largest sums of ``values`` [H, W]."""
     H, W = values.shape

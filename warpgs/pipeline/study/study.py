@@ -31,7 +31,7 @@ from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import say, say_lines
-from warpgs.report.images import Tile, contact_sheet, crops, disagreement, png
+from warpgs.report.images import Tile, contact_sheet, crops, png
 from warpgs.scene import Scene, View
 from warpgs.schema import Checked, Within
 
@@ -62,8 +62,8 @@ def view_sheets(
         images[name] = [np.clip(render_view(run.gaussians(), v, run.options())[0], 0, 1) for v in views]
     maps = []
     for i, view in enumerate(views):
-        values = disagreement([p[i] for p in images.values()], view.image)
-        maps.append(values if view.score_mask is None else values * view.score_mask)
+        spread = np.ptp([rendered[i] for rendered in images.values()], axis=0).mean(-1)
+        maps.append(spread if view.score_mask is None else spread * view.score_mask)
     sheets, width = [], max(CELL[0], min(CELL[1], MAX_WIDTH // (len(images) + 1)))
     for i in sorted(sorted(range(len(views)), key=lambda i: -float(maps[i].mean()))[:count]):
         view = views[i]
