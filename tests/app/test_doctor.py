@@ -53,8 +53,15 @@ def test_this_machine_can_fit():
 @pytest.mark.parametrize(
     ("name", "error", "topic", "status", "remedy", "code"),
     [
-        ("safetensors", ModuleNotFoundError("No module"), "safetensors", MISSING, "pip install safetensors", 4),
-        ("onnxruntime", ModuleNotFoundError("No module"), "onnxruntime", NOTE, "pip install onnxruntime", 0),
+        (
+            "safetensors",
+            ModuleNotFoundError("No module"),
+            "safetensors",
+            MISSING,
+            "pip install --force-reinstall safetensors",
+            4,
+        ),
+        ("onnxruntime", ModuleNotFoundError("No module"), "onnxruntime", NOTE, "pip install --force-reinstall onnxruntime", 0),
         ("cv2", ImportError("libGL.so.1"), "opencv-contrib-python-headless", MISSING, "system library", 4),
     ],
 )
@@ -69,7 +76,7 @@ def test_a_package_that_cannot_be_imported(monkeypatch, name, error, topic, stat
     monkeypatch.setattr(importlib, "import_module", fake)
     findings = list(doctor._packages())
     f = by_topic(findings)[topic]
-    assert f.status == status and str(error) in f.detail and remedy in f.remedy and f.required == (status == MISSING)
+    assert f.status == status and str(error) in f.detail and remedy in f.remedy
     text, returned = text_of(findings)
     assert returned == code and ("cannot run yet: " in text) == bool(code) and f.remedy[:20] in text
 
@@ -98,7 +105,7 @@ def test_no_usable_device(monkeypatch, cuda, hidden, words):
     assert f.status == NOTE and words[0] in f.detail and words[1] in f.remedy
 
 
-@pytest.mark.parametrize(("both", "status", "words"), [(True, OK, "13.1"), (False, MISSING, "Warp sees no CUDA device")])
+@pytest.mark.parametrize(("both", "status", "words"), [(True, OK, "13.1"), (False, NOTE, "Warp sees no CUDA device")])
 def test_devices_that_torch_sees(monkeypatch, both, status, words):
     found = {"is_cuda_available": both, "get_cuda_device_count": 2, "get_cuda_driver_version": (13, 1)}
     warp = types.SimpleNamespace(**{name: lambda value=value: value for name, value in found.items()})
@@ -109,15 +116,8 @@ def test_devices_that_torch_sees(monkeypatch, both, status, words):
     assert last.status == status and words in last.detail and ("--device cpu" in last.remedy) != both
 
 
-def test_caches_that_cannot_be_used(monkeypatch, tmp_path):
-    """Maps: a note. Kernels: a private folder is a note, as a fit compiles each time; none at all stops it."""
-    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "maps"))
-    (f,) = doctor._prior_cache()
-    assert f.status == OK and str(tmp_path / "maps") in f.detail
-    (tmp_path / "file").write_text("in the way")
-    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "file" / "maps"))
-    (f,) = doctor._prior_cache()
-    assert f.status == NOTE and "WARPGS_CACHE" in f.remedy and not f.required
+def test_a_cache_that_cannot_be_used(monkeypatch, tmp_path):
+    """A private folder of kernels is a note, as a fit compiles each time; none at all stops it."""
     monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: (tmp_path, "it cannot be written"))
     (f,) = doctor._kernel_cache()
     assert f.status == NOTE and "cannot be written" in f.detail and "WARP_CACHE_PATH" in f.remedy
@@ -127,7 +127,7 @@ def test_caches_that_cannot_be_used(monkeypatch, tmp_path):
 
     monkeypatch.setattr(doctor, "prepare_kernel_cache", refuse)
     (f,) = doctor._kernel_cache()
-    assert f.status == MISSING and f.required and "WARP_CACHE_PATH" in f.remedy
+    assert f.status == MISSING and "WARP_CACHE_PATH" in f.remedy
 
 
 def test_encoder_disk_and_memory(monkeypatch, tmp_path):
@@ -146,7 +146,7 @@ def test_encoder_disk_and_memory(monkeypatch, tmp_path):
 def test_eighty_columns_keep_the_keys_whole():
     findings = [
         *(Finding(row[0], OK, "1.2.3") for row in doctor.PACKAGES),
-        Finding("Kernel cache", MISSING, "/a/very/long/path" * 9, "set WARP_CACHE_PATH " + "so " * 40, True),
+        Finding("Kernel cache", MISSING, "/a/very/long/path" * 9, "set WARP_CACHE_PATH " + "so " * 40),
         Finding("CUDA", NOTE, "[bold]none[/bold] " + "word " * 30, "update"),
     ]
     text, code = text_of(findings)

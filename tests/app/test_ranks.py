@@ -192,11 +192,11 @@ class Two(ranks.Ranks):
 
 @pytest.mark.parametrize(
     "changed",
-    ["a different version of warpgs", "a different scene", "a different split", "different settings", "a different checkpoint"],
+    ["the version of warpgs", "the scene", "the split", "the settings or the code", "the checkpoint"],
 )
 def test_ranks_that_do_not_fit_the_same_are_refused(demo, tmp_path, changed):
     """Each would take its part of other steps, and the model would be that of no fit; nothing is written."""
-    with pytest.raises(UsageError, match=f"rank 1 has {changed} than rank 0: "):
+    with pytest.raises(UsageError, match=f"rank 1 differs from rank 0 in {changed}: "):
         fit(demo, out=tmp_path / "run", device="cpu", steps=1, batch=2, ranks=Two(changed), verbose=False)
     assert not (tmp_path / "run" / "config.json").exists()
 

@@ -258,8 +258,8 @@ def test_a_job_as_text_is_the_same_job(scenes, tmp_path, monkeypatch):
     for name, value in (torch | {"get_num_threads": 8}).items():
         monkeypatch.setattr(f"torch.{name}", lambda *_, value=value: value)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
-    with pytest.raises(UsageError, match="--slots and --per-gpu must be numbers from 1"):
-        local_slots("cuda", 0, 2)
+    with pytest.raises(UsageError, match="2 GPUs with --per-gpu 2 have 4; give more"):
+        local_slots("cuda", 5, 2)
     assert local_slots("cuda", None, 2) == [("cuda", 2, {"CUDA_VISIBLE_DEVICES": n}) for n in "3535"]
 
 
@@ -277,7 +277,7 @@ def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, 
     rows = list(csv.DictReader(table.splitlines()))
     assert [(r["name"], r["state"], r["steps"]) for r in rows] == [("a", "done", "2"), ("b & c", "failed", "0")]
     assert str(tmp_path) in rows[1]["message"] and str(tmp_path) not in page  # a page is sent, and tells of no folder
-    assert "<b>b &amp; c</b>" in page and 'src="a/thumbnail.jpg"' in page and "Failures" in page
+    assert "<b>b &amp; c</b>" in page and 'src="a/thumbnail.webp"' in page and "Failures" in page
     assert json.loads((tmp_path / "out" / "a" / "run" / "config.json").read_text())["config"]["seed"] == 3
     assert main(["farm", str(jobs), "--out", str(tmp_path / "out"), "--resume"]) == 2
     assert "--resume is not supported by farm" in capsys.readouterr().err

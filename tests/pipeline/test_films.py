@@ -66,7 +66,7 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         (lambda k: [{**k, "c2w": (1e200 * np.ones((4, 4))).tolist()}], "keyframe 0 must be a rigid"),
         (lambda k: [{**k, "c2w": [[1, 0], [0, 1]]}], "c2w"),
         (lambda k: [{**k, "c2w": [[math.nan] * 4] * 4}], "c2w"),
-        (lambda k: [{**k, "fov_y": 50}], "give radians"),
+        (lambda k: [{**k, "fov_y": 50}], "fov_y"),
         (lambda k: [{**k, "fov_y": 0}], "fov_y"),
         (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 s after the last"),
         (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 must be 0.001 to 86400"),
@@ -89,19 +89,19 @@ def test_keyframes_that_are_none_are_refused(model, tmp_path, change, words):
 def test_what_was_chosen_is_said(model, monkeypatch):
     plan = plan_film(model, "auto", FilmSettings(frames=4))
     assert len(plan.cameras) == 4 and plan.notes[1:] == ["path: spiral"]
-    assert plan.notes[0].startswith("5 cameras on one side of the scene, over 6")
+    assert plan.notes[0] == "5 cameras on one side of the scene"
     low, high = (
         dataclasses.replace(c, viewmat=look_at(eye, np.zeros(3), np.array([0, -1.0, 0])))
         for c, eye in zip(model.cameras().values(), np.array([[0, 0, -4.0], [0, -4 * math.sin(0.8), -4 * math.cos(0.8)]]))
     )
     above = dataclasses.replace(model, scene_cameras={"0.png": low, "1.png": high}, train=("0.png", "1.png"))
-    assert plan_film(above, "auto", FilmSettings()).notes[0] == "2 cameras on one side of the scene, over 46 degrees"
+    assert plan_film(above, "auto", FilmSettings()).notes[0] == "2 cameras on one side of the scene"
     plan = plan_film(model, "turntable", FilmSettings(seconds=0.5, fps=12, size=(64, 20), fov_y=0.5))
     assert [(c.width, c.height) for _, c in plan.cameras] == [(64, 20)] * 6 and "there and back" in plan.notes[-1]
     assert 2 * math.atan(10 / plan.cameras[0][1].K[1, 1]) == pytest.approx(0.5)
-    for size, lost, fov in (((160, 64), "height", "17 to 34"), ((80, 128), "width", "34 to 63"), ((80, 64), "", "")):
+    for size, lost, fov in (((160, 64), "height", "34"), ((80, 128), "width", "63"), ((80, 64), "", "")):
         notes = [n for n in plan_film(model, "spiral", FilmSettings(frames=2, size=size)).notes if "shape" in n]
-        said = f"frames have another shape than the photographs, and show 50% of their {lost}; --fov {fov} shows more"
+        said = f"frames have another shape than the photographs, and show 50% of their {lost}; --fov {fov} shows all"
         assert notes == [said] * bool(lost)
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
     assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 cameras in the given order")
@@ -135,7 +135,7 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     assert "4 of 6 frames are black (frames 0, 1, 2, 5)" in notes[-1]
     white = np.ones((4, 4, 3))  # a tenth of what a training view shows is nearly nothing, however much that is
     assert [bool(fault_of(white, np.full((4, 4), alpha), 0.5)) for alpha in (0.04, 0.06)] == [True, False]
-    assert "(frames 0, 3, 6, 9, 12, 15, 18, 21 and 6 more)" in fault_notes(["are black", "", ""] * 14, "", "")[0]
+    assert "(frames 0, 3, 6, 9, 12, 15, 18, 21 and 6 more)" in fault_notes(["are black", "", ""] * 14, "")[0]
 
 
 @pytest.mark.parametrize(
@@ -144,8 +144,8 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
         ("auto", {}, None),
         ("interpolate", {}, None),
         ("auto", {"size": (160, 32)}, None),
-        ("spiral", {"fov_y": 1.0}, "keep the shape and the field of view of the photographs"),
-        ("own", {}, "move the cameras nearer to the photographs' cameras"),
+        ("spiral", {"fov_y": 1.0}, "--path interpolate stays at the training views"),
+        ("own", {}, "turn back"),
     ],
 )
 def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, advice):
@@ -153,17 +153,15 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
     if path == "own":
         first = model.cameras()["0.png"]
         aside = [dataclasses.replace(first, viewmat=first.viewmat @ (np.eye(4) + x * np.eye(4, k=3))) for x in (0.0, -0.6)]
-        plan = FilmPlan([(str(i), c) for i, c in enumerate(aside)], 0.0, "", [])
+        plan = FilmPlan([(str(i), c) for i, c in enumerate(aside)], 0.0, "turn back", [])
     else:
         plan = plan_film(model, path, FilmSettings(frames=2, **settings))
     notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings())[1] if "outside all photographs" in n]
-    ahead = film.foreseen(model, plan, FilmSettings())  # the same without the numbers, before the frames are rendered
-    assert len(notes) == len(ahead) == (advice is not None)
+    assert len(notes) == (advice is not None)
     if advice:
         frames = "1 of 2 frames have over 10% of their pixels outside all photographs (frames 1)"
         assert notes[0].startswith(frames if path == "own" else "2 of 2 frames")
-        assert notes[0].endswith(f"expect artefacts there; {advice}") and ahead[0].endswith(f"expect artefacts there; {advice}")
-        assert ahead[0].startswith("1 of 2 frames looked at" if path == "own" else "2 of 2 frames looked at")
+        assert notes[0].endswith(f"expect artefacts there; {advice}")
 
 
 def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):

@@ -426,7 +426,7 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
     shown = show(scene, "--out", out)
     for code, word, words in (
         (2, "give show or export", ["priors"]), (2, "give show or export", ["priors", "draw"]),
-        (2, "--threads must be a number from 0", [*shown, "--threads", "-1"]),
+        (2, "--threads must be in [0, 4096]", [*shown, "--threads", "-1"]),
         (2, "depth-size was removed: give it in FILE.onnx.json", [*shown, "--depth-size", "64"]),
         (3, "not an ONNX model", [*shown, "--depth-model", str(file)]),
         (3, "cannot be read", [*shown, "--segmentation-model", str(tmp_path / "none.onnx")]),
@@ -463,7 +463,10 @@ def test_the_mean_colour_is_of_training_pixels_that_count(tmp_path):
         np.testing.assert_allclose(color, expected, atol=1e-6)
         assert "the mean colour of the training views, #" in note
     assert choose_background("scene", scene, train) == ((0, 0, 0), "")
-    assert choose_background("#ff0000", scene, train) == ((1, 0, 0), "background: #ff0000, #ff0000")
+    assert choose_background("#ff0000", scene, train) == (
+        (1, 0, 0),
+        "background: #ff0000, #ff0000; change it with --background",
+    )
     assert [n for n, c in PRESETS.items() if c.background == "auto"] == ["default", "quick"]
 
 
@@ -471,8 +474,8 @@ def test_cut_out_objects_keep_the_background_of_the_scene(tmp_path):
     """Whether they know their opacity or stand on black; transparent pixels change with another one, and come back."""
     scene = load_scene(scenes.write_blender(tmp_path))
     color, note = choose_background("auto", scene, list(scene.views))
-    assert color == (1, 1, 1) and "#ffffff, since the views show a cut-out object" in note
-    assert choose_background("scene", scene, list(scene.views))[1] == "background: #ffffff, from the scene's files"
+    assert color == (1, 1, 1) and "since views show a cut-out object, #ffffff" in note
+    assert choose_background("scene", scene, list(scene.views))[1] == note
     black = [dataclasses.replace(v, image=v.image * (v.alpha[..., None] > 0), alpha=None) for v in scene.views]
     assert choose_background("auto", dataclasses.replace(scene, background=(0, 0, 0)), black)[0] == (0, 0, 0)
     half = [dataclasses.replace(v, alpha=v.alpha * np.float32(0.5), image=(v.image + 1) / 2) for v in scene.views]

@@ -217,7 +217,8 @@ def test_a_box_of_the_same_place_cuts_the_same_surface(run, tmp_path, capsys):
         n = open_run(run, "cpu").normalization
         center = convert_points(middle[None], n, "scene", "file")[0].tolist()
         size = (np.array([1.5, 1.2, 1.0]) * place.scale / n.scale).tolist()
-        box = json.dumps({"center": center, "size": size, "rotation": (n.rotation.T @ axes).tolist()})
+        box = tmp_path / "box.json"
+        box.write_text(json.dumps({"center": center, "size": size, "rotation": (n.rotation.T @ axes).tolist()}))
         voxel = 0.06 * place.scale / n.scale
         assert sh("mesh", run, "--out", tmp_path / f"{name}.ply", "--voxel", voxel, "--crop", box) == 0
         assert f"voxel {voxel:.4g} m" in capsys.readouterr().out

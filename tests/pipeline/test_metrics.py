@@ -526,15 +526,11 @@ def test_bad_and_packed_sources_are_named(files, tmp_path):
     refused("not finite", backbone=saved(nan))
     import zipfile
 
-    for packing, words in (
-        (zipfile.ZIP_DEFLATED, r"unpacks to [\d,]+ bytes, more than its size"),
-        (zipfile.ZIP_STORED, "besides its"),
-    ):
-        with zipfile.ZipFile(files[4]) as old, zipfile.ZipFile(tmp_path / "heads.pth", "w", packing) as new:
-            for name in old.namelist():
-                new.writestr(name, old.read(name) + b" " * 2**20)
-        with pytest.raises(DataError, match=f"heads.pth: cannot be read .*{words}"):
-            convert_lpips(files[3], tmp_path / "heads.pth", tmp_path / "out")
+    with zipfile.ZipFile(files[4]) as old, zipfile.ZipFile(tmp_path / "heads.pth", "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name) + b" " * 2**20)
+    with pytest.raises(DataError, match=r"heads.pth: cannot be read .*unpacks to [\d,]+ bytes, more than its size"):
+        convert_lpips(files[3], tmp_path / "heads.pth", tmp_path / "out")
 
 
 def test_bad_weights_are_named(weights, tmp_path, monkeypatch):

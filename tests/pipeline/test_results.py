@@ -164,7 +164,7 @@ def test_exact_trades_nothing_and_the_seed_draws_views_and_parts(device):
     """The arithmetic alone, and no second time; kernels and truth leave out a Gaussian that is no number."""
     found = rule_report_of(crowd(device), photos(5, 150, 100), EXACT, seed=3)
     assert 0 < found["mean"] < 2e-6 and "exact_ms" not in found and found["psnr"] > 90
-    assert "has the cut-offs of 3DGS" in found["summary"] and "random training views" in found["summary"]
+    assert "has the cut-offs of 3DGS" in found["summary"] and "3 training views" in found["summary"]
     g = crowd(CPU)
     g.means[5] = float("nan")
     assert rule_report_of(g, photos(1, 150, 100), EXACT, seed=0)["mean"] < 2e-6
@@ -314,7 +314,7 @@ def test_story_follows_the_switches(run, tmp_path):
     assert "sampled at random" in story[0] and "above its 0.6 quantile" in story[0] and "rendered depth" in story[0]
     assert [c for c, _ in story[1]] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
     assert story[1][0][1] == webp(min((out / "sampling").iterdir()).read_bytes(), SHEET_WIDTH, 70)
-    assert dict(zip(*story[2]))["sampling events"] == str(len(fit.strategy.events)) and "widened" not in story[0]
+    assert dict(zip(*story[2]))["sampling events"] == str(len(fit.strategy.events))
 
     def words_of(own, fraction=0.2):
         method = dataclasses.replace(METHOD, sampler=dataclasses.replace(METHOD.sampler, fraction=fraction))
@@ -323,10 +323,9 @@ def test_story_follows_the_switches(run, tmp_path):
     own = PaperConfig(agp=False, depth="consistent")
     words = words_of(own)
     assert "the highest in S_importance" in words and "other views confirm and with S_geometry" in words
-    assert "In 3 of 3 samplings the gate was widened" in words
     assert "all pixels that Gaussians cover" in words_of(dataclasses.replace(own, ra=False))
     words = words_of(PaperConfig(s_render=False, s_semantic=False, s_geometry=False), 0.01)
-    assert "sampled uniformly at random" in words and "All scores have weight 0" in words
+    assert "sampled uniformly at random" in words
     plain = fitted(dataclasses.replace(CONFIG, strategy="clone_split", strategy_config=None), 1)
     assert sampling_report_of(plain, tmp_path) is None
 

@@ -280,7 +280,7 @@ def test_extrapolated_points_come_last_or_a_start_says_why_there_are_none():
     masked = [dataclasses.replace(v, mask=corner) for v in views]
     config = InitConfig(source="sweep", merge_px=4, fill_px=8, extrapolate=True)
     random = dataclasses.replace(config, source="random", random_count=200)
-    for given, settings, reason in ((masked, config, "none extrapolated, because masks"), (views, random, "sweep or flow")):
+    for given, settings, reason in ((masked, config, "none extrapolated (masks"), (views, random, "sweep or flow")):
         start = initial_points(given, None, settings, np.random.default_rng(0))
         assert reason in start.how and start.extrapolated == 0
         plain = dataclasses.replace(settings, extrapolate=False)

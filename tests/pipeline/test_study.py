@@ -33,6 +33,7 @@ from warpgs.pipeline.run.request import CPU_MAX_SIDE, FitRequest, SceneRequest, 
 from warpgs.pipeline.study import study
 from warpgs.pipeline.study.study import (
     ABLATION_ROWS,
+    BOXES,
     FILES,
     SWITCHES,
     StudyRequest,
@@ -59,7 +60,7 @@ from warpgs.pipeline.train.presets import PRESETS, preset_settings
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.strategies.sampling import MethodConfig
-from warpgs.report.images import BOXES, crops, disagreement, sheet
+from warpgs.report.images import crops
 from warpgs.synthetic.demo import split_spec
 
 BASE, OTHER = [20.0, 20.2, 20.1], [20.6, 20.7, 20.8]
@@ -177,7 +178,9 @@ def test_every_run_is_an_ordinary_run_folder_and_tables_are_of_these_runs(finish
             assert (m["seed"], m["steps"]) == (seed, steps)
     assert all((request.out / f).is_file() for f in FILES)
     image = Image.open(request.out / "figure.png")
-    assert image.width > 3 * 180 and image.height > 200
+    assert 3 * 180 < image.width < 2600 and image.height > 200
+    colors = {tuple(c) for c in np.unique(np.asarray(image).reshape(-1, 3), axis=0).tolist()}
+    assert {tuple(round(255 * v) for v in color) for color in BOXES} <= colors
     record = json.loads((request.out / "study.json").read_text())
     assert record["seeds"] == 2 and set(record["variants"]) == {"a", "b b"}
     assert len(record["scenes"]["still"]["fingerprint"]) == 64
@@ -382,7 +385,7 @@ def fail(text):
 def test_requests_that_make_no_sense(scene, tmp_path, capsys):
     both = {"a": A, "b": B}
     for words, scenes, variants, seeds in (
-        ("--seeds must be a number from 1 to 1000", (scene,), both, 0), ("at least two settings", (scene,), {"a": A}, 2),
+        (r"--seeds must be in \[1, 1000\]", (scene,), both, 0), ("at least two settings", (scene,), {"a": A}, 2),
         ("are named", (scene, scene), both, 2), ("name at least one scene", (), both, 2),
     ):  # fmt: skip
         with pytest.raises(UsageError, match=words):
@@ -529,14 +532,10 @@ def test_forest_draws_every_seed_and_prints_every_interval():
     assert "no pair of runs to compare" in forest(Table("t", ("lpips",), {"a": {}, "b": {}}, one))
 
 
-def test_crops_find_where_pictures_differ_and_a_sheet_shows_them():
-    truth = np.zeros((40, 60, 3), np.float32)
-    a, b = truth.copy(), truth.copy()
-    a[30:36, 44:54] = 0.9
-    b[4:10, 4:14] = 0.5
-    values = disagreement([a, b, truth], truth)
-    assert values[32, 50] == pytest.approx(0.9) and values[5, 5] == pytest.approx(0.5) and values[20, 20] == 0
-    assert np.allclose(disagreement([a], truth), a[..., 0])
+def test_crops_find_where_pictures_differ():
+    values = np.zeros((40, 60), np.float32)
+    values[30:36, 44:54] = 0.9
+    values[4:10, 4:14] = 0.5
     (x0, y0), (x1, y1) = crops(values, 12, 8, 2)
     assert x0 <= 44 and x0 + 12 >= 54 and y0 <= 30 and y0 + 8 >= 36
     assert x1 <= 4 and x1 + 12 >= 14 and y1 <= 4 and y1 + 8 >= 10
@@ -545,16 +544,3 @@ def test_crops_find_where_pictures_differ_and_a_sheet_shows_them():
     many = crops(np.random.default_rng(0).random((20, 20)), 10, 10, 9)
     assert 1 <= len(many) <= 4
     assert all(abs(a - c) >= 10 or abs(b - d) >= 10 for i, (a, b) in enumerate(many) for c, d in many[:i])
-    colors = [(0.2, 0.4, 0.6), (0.8, 0.1, 0.3), (0.5, 0.5, 0.1)]
-    cells = [(np.full((30, 40, 3), c, np.float32), f"{i}.00 dB") for i, c in enumerate(colors)]
-    data = sheet(["a", "b" * 90, "photograph"], [("scene, view", cells, [(2, 3, 8, 6), (20, 10, 8, 6)])] * 2)
-    image = np.array(Image.open(io.BytesIO(data)))
-    assert image.dtype == np.uint8 and image.shape[2] == 3 and image.shape[1] <= 2600
-    areas = [int((image == np.round(np.array(c) * 255).astype(np.uint8)).all(-1).sum()) for c in colors]
-    assert min(areas) > 0.9 * max(areas) > 0
-    assert all((image == box).all(-1).sum() > 100 for box in BOXES[:2])
-    cell = (np.zeros((24, 32, 3), np.float32), "")
-    wide = Image.open(io.BytesIO(sheet([str(i) for i in range(10)], [("s", [cell] * 10, [])])))
-    assert wide.width <= 2600 and math.isclose(wide.width / 10, 256, rel_tol=0.2)  # ten columns share the width
-    # what is left of the page is paper, so the labels have not grown over the pictures
-    assert (image[:4] == 255).all() and (image[:, :8] == 255).all()

@@ -473,8 +473,8 @@ def test_the_farm(scene, tmp_path):
     page = (out / "index.html").read_text("utf-8")
     (row,) = csv.DictReader(io.StringIO((out / "results.csv").read_text("utf-8")))
     assert row["name"] == "sceneb\\xe4ü" and row["state"] == "done"
-    assert "sceneb%E4%C3%BC/run/report.html" in page and "sceneb%E4%C3%BC/thumbnail.jpg" in page
-    assert cv2.imdecode(np.fromfile(out / scene.name / "thumbnail.jpg", np.uint8), cv2.IMREAD_COLOR) is not None
+    assert "sceneb%E4%C3%BC/run/report.html" in page and "sceneb%E4%C3%BC/thumbnail.webp" in page
+    assert cv2.imdecode(np.fromfile(out / scene.name / "thumbnail.webp", np.uint8), cv2.IMREAD_COLOR) is not None
 
 
 @on_linux

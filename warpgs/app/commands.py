@@ -9,16 +9,22 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg  # noqa: TID253 - flags are annotations, and only a command imports this file
 
-from warpgs.app.flags import MAX_THREADS, call, check_range, listed
+from warpgs.app.flags import Port, Threads, call, listed
 from warpgs.errors import UsageError
 from warpgs.io.image_files import MAX_PIXELS
 from warpgs.process import say, say_lines
 from warpgs.report.progress import Stages, waiting
+from warpgs.schema import Checked, Within
+
+Side = Annotated[int, Within(32, 8192)]
+"""Side of a synthetic image [px]."""
+Pixels = Annotated[int, Within(1, 2**40)]
+"""Number of pixels of an image."""
 
 
 def demo(
-    folder: Positional[Path], *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0, object: bool = False,
-    format: Literal["transforms", "colmap"] | None = None,
+    folder: Positional[Path], *, views: Annotated[int, Within(8, 10_000)] = 24, width: Side = 320, height: Side = 240,
+    seed: Annotated[int, Within(0, 2**31 - 1)] = 0, object: bool = False, format: Literal["transforms", "colmap"] | None = None,
 ) -> None:  # fmt: skip
     """Write a synthetic scene.
 
@@ -31,10 +37,6 @@ def demo(
         object: Write a single object instead of a still life; eight of the views are for training.
         format: Format of --object: transforms (transforms.json with RGBA images; default) or colmap (RGB images with masks).
     """
-    check_range("--views", views, 8, 10_000)
-    check_range("--width", width, 32, 8192)
-    check_range("--height", height, 32, 8192)
-    check_range("--seed", seed, 0, 2**31 - 1)
     if format is not None and not object:
         raise UsageError("--format requires --object: the still life is always written as COLMAP")
     from warpgs.synthetic.demo import write_demo, write_object
@@ -52,8 +54,8 @@ def demo(
 
 
 def poses(
-    photographs: Positional[Path], *, out: Path, frames: int | None = None, threads: int = 0, max_pixels: int = MAX_PIXELS,
-    allow_outside: bool = False, matcher: Path | None = None,
+    photographs: Positional[Path], *, out: Path, frames: Annotated[int | None, Within(3, 1000)] = None, threads: Threads = 0,
+    max_pixels: Pixels = MAX_PIXELS, allow_outside: bool = False, matcher: Path | None = None,
 ) -> None:  # fmt: skip
     """Find the poses of photographs or of a video.
 
@@ -69,9 +71,6 @@ def poses(
     from warpgs.poses.find import FRAMES, TEXT, find_poses, report_lines
 
     frames = FRAMES if frames is None else frames
-    check_range("--frames", frames, 3, 1000)
-    check_range("--threads", threads, 0, MAX_THREADS)
-    check_range("--max-pixels", max_pixels, 1, 2**40)
     record = find_poses(
         photographs, out, frames=frames, threads=threads, max_pixels=max_pixels, allow_outside=allow_outside, matcher=matcher,
         progress=Stages(),
@@ -81,7 +80,7 @@ def poses(
     say(f"next: warpgs fit {shlex.quote(str(out))} --out run")
 
 
-def view(run: Positional[Path], *, port: int = 8080, device: str = "auto", reader: str | None = None) -> None:
+def view(run: Positional[Path], *, port: Port = 8080, device: str = "auto", reader: str | None = None) -> None:
     """Look at a model in a browser.
 
     Args:
@@ -90,7 +89,6 @@ def view(run: Positional[Path], *, port: int = 8080, device: str = "auto", reade
         device: Device that renders depth, coverage and error: auto, cpu or cuda.
         reader: User-defined reader, as for `warpgs fit --reader`.
     """
-    check_range("--port", port, 0, 65535)
     from warpgs.viewer.watch import view as show
 
     show(run, port, device, reader)
@@ -98,9 +96,9 @@ def view(run: Positional[Path], *, port: int = 8080, device: str = "auto", reade
 
 def render(
     run: Positional[Path], *, cameras: Path | None = None, rule: str | None = None, antialiased: bool = False,
-    path: str = "auto", out: Path | None = None, seconds: float | None = None, fps: int = 30, frames: int | None = None,
-    size: tuple[int, int] | None = None, fov: float | None = None, background: str = "auto", sheet: bool = False,
-    device: str = "auto", coverage: bool = False, near: float | None = None,
+    path: str = "auto", out: Path | None = None, seconds: float | None = None, fps: Annotated[int, Within(1, 1000)] = 30,
+    frames: int | None = None, size: tuple[int, int] | None = None, fov: float | None = None, background: str = "auto",
+    sheet: bool = False, device: str = "auto", coverage: bool = False, near: Annotated[float | None, Within(0, 1e9)] = None,
 ) -> list[str]:  # fmt: skip
     """Render a run or a file of Gaussians.
 
@@ -127,9 +125,6 @@ def render(
         coverage: Also write images of the coverage by training views, into the subfolder coverage.
         near: Nearest depth that is rendered of a file of Gaussians, in its units. Default: that of the rule (inria: 0.2).
     """
-    check_range("--fps", fps, 1, 1000)
-    if near is not None:
-        check_range("--near", near, 0, 1e9)
     if run.is_dir() and (cameras is not None or rule is not None or antialiased or near is not None):
         raise UsageError("--cameras, --rule, --antialiased and --near are for files of Gaussians; leave them out for a run")
     from warpgs.pipeline.films.film import FilmSettings
@@ -311,7 +306,7 @@ def show_priors() -> Command:
 
     def show(
         scene: Positional[Path], *, out: Path, split: str | None = None, downscale: int | None = None,
-        max_side: int | None = None, allow_outside: bool = False, max_pixels: int = MAX_PIXELS, threads: int = 0,
+        max_side: int | None = None, allow_outside: bool = False, max_pixels: Pixels = MAX_PIXELS, threads: Threads = 0,
         source: Literal["sweep", "flow"] = "sweep", priors: OmitArgPrefixes[PriorConfig],
     ) -> list[str]:  # fmt: skip
         """Write depth and saliency.
@@ -328,7 +323,6 @@ def show_priors() -> Command:
             source: Method of depth estimation without a network: sweep or flow, as for --init.source of a fit.
             priors: Networks.
         """
-        check_range("--threads", threads, 0, MAX_THREADS)
         sizes = {"downscale": downscale, "max_side": max_side, "max_pixels": max_pixels}
         request = SceneRequest(str(scene), split, allow_outside=allow_outside, **sizes)
         return commands.show_priors(request, priors, source, out, threads)
@@ -409,7 +403,7 @@ def study_flags() -> type:
     reading, unread = scene_flags(positional=False)
 
     @dataclass(frozen=True, kw_only=True)
-    class Study:
+    class Study(Checked, group="--"):
         scenes: Positional[tuple[Path, ...]]
         """Scene folders."""
         out: Path
@@ -420,10 +414,10 @@ def study_flags() -> type:
         """Optimisation steps of every run. Default: as in `warpgs fit`."""
         device: str = "auto"
         """auto, cpu or cuda."""
-        slots: int | None = None
+        slots: Annotated[int | None, Within(1)] = None
         """Number of concurrent runs, each in its own process. If neither --slots nor --per-gpu is given, runs follow each other
         in one process."""
-        per_gpu: int | None = None
+        per_gpu: Annotated[int | None, Within(1)] = None
         """Runs that share a GPU."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
@@ -438,8 +432,7 @@ def run_study_of(a: Any, variants: dict, marks: dict) -> list[str]:
     from warpgs.pipeline.study.study import StudyRequest, run_study
 
     scenes = tuple(scene_of(a.reading, str(s)) for s in a.scenes)
-    apart = a.slots is not None or a.per_gpu is not None
-    engine = {"slots": a.slots, "per_gpu": 1 if a.per_gpu is None else a.per_gpu} if apart else None
+    engine = {n: v for n in ("slots", "per_gpu") if (v := getattr(a, n)) is not None} or None
     return run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, engine, marks))
 
 

@@ -6,7 +6,6 @@ import os
 import platform
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,6 @@ from warpgs.process import Say, counted, fast_imports, hidden_stderr, printable,
 from warpgs.report.progress import Stages, waiting
 
 OK, MISSING, NOTE = "ok", "missing", "note"
-PYTHON = ((3, 11), (3, 14))  # lowest version, and the first one that is too new
 LOW_DISK = 2 * 2**30  # [bytes]; a run folder with checkpoints and a video fits well into this
 LOW_MEMORY = 4 * 2**30  # [bytes]
 
@@ -31,13 +29,11 @@ class Finding:
     topic: str
     """Subject in a few words, unique within a report."""
     status: Literal["ok", "missing", "note"]
-    """``missing`` where something does not work; ``note`` where a fit works, but slower or with fewer features."""
+    """``missing`` where no fit works; ``note`` where a fit works, but slower or with fewer features."""
     detail: str
     """Observation, as text."""
     remedy: str = ""
     """Fix; never empty where the status is ``missing``."""
-    required: bool = False
-    """True if a fit needs what was checked."""
 
 
 PACKAGES = (
@@ -73,10 +69,7 @@ def _noted(topic: str, sound: bool, detail: str, remedy: str) -> Finding:
 
 
 def _python() -> Iterable[Finding]:
-    detail, (low, high) = f"{platform.python_version()} at {sys.executable}", PYTHON
-    sound, span = low <= sys.version_info[:2] < high, f">={low[0]}.{low[1]}, <{high[0]}.{high[1]}"
-    remedy = "" if sound else f"create an environment with Python {span}"
-    yield Finding("Python", OK if sound else MISSING, detail, remedy, True)
+    yield Finding("Python", OK, f"{platform.python_version()} at {sys.executable}")
     yield Finding("System", OK, f"{platform.system()} {platform.release()} on {platform.machine()}")
 
 
@@ -85,16 +78,14 @@ def _package(distribution: str, name: str, required: bool, use: str) -> Finding:
     try:
         module = importlib.import_module(name)
     except Exception as e:
-        remedy = f"pip install {distribution}"
-        if not isinstance(e, ModuleNotFoundError):
-            remedy = f"pip install --force-reinstall {distribution}, or install the system library that the message names"
+        remedy = f"pip install --force-reinstall {distribution}, or install the system library that the message names"
         without = "a fit needs it" if required else "a fit runs without it"
-        return Finding(distribution, MISSING if required else NOTE, f"{_reason(e)} ({use}; {without})", remedy, required)
+        return Finding(distribution, MISSING if required else NOTE, f"{_reason(e)} ({use}; {without})", remedy)
     detail = str(getattr(module, "__version__", "of unknown version"))
     if name == "onnxruntime":
         names = [n.removesuffix("ExecutionProvider") for n in module.get_available_providers()]
         detail += f", providers: {', '.join(names)}"
-    return Finding(distribution, OK, detail, required=required)
+    return Finding(distribution, OK, detail)
 
 
 def _packages() -> Iterable[Finding]:
@@ -164,22 +155,7 @@ def _warp_cuda() -> Finding:
         why = "Warp sees no CUDA device though torch does"
     except Exception as e:
         why = _reason(e)
-    return Finding("Warp on CUDA", MISSING, why, "update the NVIDIA driver and warp-lang, or fit with --device cpu")
-
-
-def _prior_cache() -> Iterable[Finding]:
-    """Check the cache folder for maps of networks; a fit works without it."""
-    from warpgs.priors.networks import cache_folder
-
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as e:
-        remedy = "set WARPGS_CACHE to a folder that you may write to"
-        return [Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run again each time", remedy)]
-    return [Finding("Prior cache", OK, f"{folder}, writable")]
+    return Finding("Warp on CUDA", NOTE, why, "update the NVIDIA driver and warp-lang, or fit with --device cpu")
 
 
 def _kernel_cache() -> Iterable[Finding]:
@@ -190,12 +166,12 @@ def _kernel_cache() -> Iterable[Finding]:
         refused = prepare_kernel_cache()[1]
     except Exception as e:
         known, remedy = isinstance(e, ResourceError), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to"
-        return [Finding(topic, MISSING, str(e) if known else _reason(e), remedy if known else "fix warp-lang first", True)]
+        return [Finding(topic, MISSING, str(e) if known else _reason(e), remedy if known else "fix warp-lang first")]
     if refused:
         remedy = "set WARP_CACHE_PATH to a folder that only you may write to"
-        return [Finding(topic, NOTE, f"{refused}; every run compiles its kernels for up to a minute", remedy, True)]
+        return [Finding(topic, NOTE, f"{refused}; every run compiles its kernels for up to a minute", remedy)]
     first = "" if any(folder.iterdir()) else "; empty: the first fit compiles for up to a minute"
-    return [Finding(topic, OK, f"{folder}, writable{first}", required=True)]
+    return [Finding(topic, OK, f"{folder}, writable{first}")]
 
 
 def _video() -> Iterable[Finding]:
@@ -224,7 +200,7 @@ def _disk() -> Iterable[Finding]:
 
 
 CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
-    _python, _packages, _extras, _processor, _cuda, _kernel_cache, _prior_cache, _video, _disk,
+    _python, _packages, _extras, _processor, _cuda, _kernel_cache, _video, _disk,
 )  # fmt: skip
 
 
@@ -260,7 +236,7 @@ def print_report(findings: list[Finding], console=None) -> int:
         fix = f"\n[{style}]fix: {escape(printable(f.remedy))}[/]" if f.status != OK and f.remedy else ""
         table.add_row(escape(f.topic.removesuffix("-python-headless")), f"[{style}]{f.status}[/]", detail + fix)
     console.print(table)
-    if stops := [f.topic for f in findings if f.status == MISSING and f.required]:
+    if stops := [f.topic for f in findings if f.status == MISSING]:
         console.print(f"[bold red]A fit cannot run yet[/]: {escape(', '.join(stops))}.")
         return ResourceError.exit_code
     console.print("[bold green]A fit can run here.[/]")

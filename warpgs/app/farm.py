@@ -2,12 +2,13 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from warpgs.app.fit import request_of, tell_preset
 from warpgs.app.flags import call
 from warpgs.errors import UsageError
 from warpgs.pipeline.farm.job import FARM_FLAGS, FarmJob, ListedJob, list_jobs
+from warpgs.schema import Within
 
 OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-folder", "out", "help", "help-all")
 """Flags of the farm itself; all others are those of `warpgs fit`."""
@@ -26,7 +27,8 @@ def run(arguments: list[str], about: str) -> int:
 
     def farm(
         jobs: Positional[str], *, out: Path, engine: Literal["local", "ray", "slurm"] = "local",
-        slots: int | None = None, per_gpu: int = 1, threads: int = 1, minutes: int = 240, partition: str | None = None,
+        slots: Annotated[int | None, Within(1)] = None, per_gpu: Annotated[int, Within(1)] = 1,
+        threads: Annotated[int, Within(1)] = 1, minutes: Annotated[int, Within(1)] = 240, partition: str | None = None,
         slurm_folder: Path | None = None,
     ) -> None:  # fmt: skip
         """Fit many scenes.

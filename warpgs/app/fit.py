@@ -4,7 +4,6 @@ import dataclasses
 import inspect
 import itertools
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +27,7 @@ from warpgs.pipeline.train.view_modules import VIEW_MODULES
 from warpgs.plugins import Registry, flag_group
 from warpgs.process import be_quiet, fast_imports, say
 from warpgs.ranks import join, place
+from warpgs.schema import Checked
 
 
 def scene_flags(*, positional: bool) -> tuple[type, Any]:
@@ -39,8 +39,8 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
 def scene_of(a: Any, path: str) -> SceneRequest:
     """Return the request for a scene folder from parsed flags; a user-defined reader is loaded."""
     asked = flags.settings_of(SceneRequest, a)
-    if asked.downscale is not None:
-        flags.check_range("--downscale", asked.downscale, 1, flags.MAX_WHOLE)
+    if asked.downscale is not None and asked.downscale < 1:
+        raise UsageError(f"--downscale must be at least 1, not {asked.downscale}")
     if asked.reader is not None:
         READERS.load(asked.reader)
     named = {n: getattr(asked, n) for n in ("score_masks", "matcher", "depths", "normals")}
@@ -58,14 +58,14 @@ CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request:
+class Request(Checked, group="--"):
     """Flags that are not settings of a fit: its input, output and machine."""
 
     out: Path
     """Run folder to fill; new or empty."""
     device: str = "auto"
     """auto, cpu or cuda."""
-    threads: int = 0
+    threads: flags.Threads = 0
     """CPU threads; 0 for as many as there are cores."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes the scene, the device and
@@ -76,7 +76,7 @@ class Request:
     """Choose the number of steps so that set-up and steps take about this time [s]; not if --steps or --resume is given."""
     view: bool = False
     """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
-    view_port: int = 8080
+    view_port: flags.Port = 8080
     """Port of --view; 0 for any free one."""
 
 
@@ -126,22 +126,14 @@ def _choices() -> str:
     return "\n\n".join(flags.listed(title, kind.described()) for title, kind in kinds.items())
 
 
-def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:
-    """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
-    )  # fmt: skip
-
-
 def _names(parts: Parts) -> Any:
     """Return the rule of a flag that names parts of a registry; their settings are flags of their own."""
-    return _read_by("NAME,...", lambda _: tuple(parts.values()), tuple, lambda v: ",".join(t.name for t in v) or "none")
+    return flags.read_by("NAME,...", lambda _: tuple(parts.values()), tuple, lambda v: ",".join(t.name for t in v) or "none")
 
 
 def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
-    size = _read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
+    size = flags.read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
     special = {
         "memory_limit": (size,), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
         "priors": (tyro.conf.OmitArgPrefixes,), "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
@@ -208,8 +200,6 @@ def _continued(arguments: list[str], scene: list[str], about: str) -> FitRequest
 
 def _machine(a: Any) -> int | None:
     """Set the number of threads; return the port of the viewer, None for no viewer."""
-    flags.check_range("--threads", a.threads, 0, flags.MAX_THREADS)
-    flags.check_range("--view-port", a.view_port, 0, 65535)
     if a.threads:
         set_threads(a.threads)
     return a.view_port if a.view else None
@@ -225,7 +215,6 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     scene = scene_of(a.reading, a.reading.path)
     view_port = _machine(a)
     config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
-    flags.check_range("--steps", config.steps or 1, 1, flags.MAX_WHOLE)
     if a.time_budget is not None:
         if a.resume or flags.word_after(arguments, "--steps"):
             raise UsageError("--time-budget chooses the steps; leave out --steps. To continue, give only --out RUN --resume")

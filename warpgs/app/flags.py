@@ -15,27 +15,39 @@ import tyro  # noqa: TID253 - only a command imports this file
 
 from warpgs.errors import UsageError, field_docs
 from warpgs.process import say_lines
+from warpgs.schema import Within, rules_of
 
 REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
 """What replaces flags that are gone, by their names with dashes."""
 SPELLED = {"--size": "1080 1920"}
 """Examples of flags that take several values."""
-MAX_THREADS = 4096
-"""Most threads that a flag takes."""
-MAX_WHOLE = 2**31 - 1
-"""Largest number of steps and factor of a size: the largest integer of 32 bits."""
+Threads = Annotated[int, Within(0, 4096)]
+"""Number of threads."""
+Port = Annotated[int, Within(0, 65535)]
+"""Port of this machine."""
 
 Settings = TypeVar("Settings")
 
 
 def call(command: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
-    """Call a function with the arguments of a command line as its own; return its result."""
+    """Call a function with the arguments of a command line as its own, in the ranges of its hints; return its result."""
 
     @functools.wraps(command)
-    def later(*values: Any, **named: Any) -> Callable[[], Any]:
-        return functools.partial(command, *values, **named)
+    def later(**named: Any) -> Callable[[], Any]:
+        for name, rule in rules_of(command):
+            if named[name] is not None and not rule.allows(named[name]):
+                raise UsageError(f"--{name.replace('_', '-')} must be {rule}, not {named[name]}")
+        return functools.partial(command, **named)
 
     return parse_flags(later, arguments, program, description)()
+
+
+def read_by(metavar: str, read: Callable[[str], Any], kind: Any, text: Callable[[Any], str]) -> Any:
+    """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
+    )  # fmt: skip
 
 
 def _open_value(info: Any) -> Any:
@@ -46,15 +58,13 @@ def _open_value(info: Any) -> Any:
         return None
     words = {"none": None} | ({"true": True, "false": False} if kind is bool else {})
 
-    def read(given: list[str]) -> Any:
-        if given[0].lower() not in words and kind is bool:
-            raise ValueError(f"expected true, false or none, got {given[0]!r}")
-        return words[given[0].lower()] if given[0].lower() in words else kind(given[0])
+    def read(word: str) -> Any:
+        if word.lower() not in words and kind is bool:
+            raise ValueError(f"expected true, false or none, got {word!r}")
+        return words[word.lower()] if word.lower() in words else kind(word)
 
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar="|".join([*words, *([] if kind is bool else [kind.__name__.upper()])]), instance_from_str=read,
-        is_instance=lambda value: value is None or isinstance(value, (int, kind)), str_from_instance=lambda v: [str(v).lower()],
-    )  # fmt: skip
+    metavar = "|".join([*words, *([] if kind is bool else [kind.__name__.upper()])])
+    return read_by(metavar, read, (int, kind), lambda value: str(value).lower())
 
 
 def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
@@ -109,12 +119,6 @@ def settings_of(kind: type[Settings], flags: Any) -> Settings:
     hints = typing.get_type_hints(kind)
     values = {f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)}
     return kind(**{n: settings_of(hints[n], v) if dataclasses.is_dataclass(hints[n]) else v for n, v in values.items()})
-
-
-def check_range(flag: str, value: float, low: float, high: float) -> None:
-    """Check the number of a flag."""
-    if not low <= value <= high:
-        raise UsageError(f"{flag} must be a number from {low:,} to {high:,}, not {value}")
 
 
 def listed(title: str, lines: Mapping[str, str]) -> str:

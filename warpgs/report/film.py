@@ -63,10 +63,7 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
     durations = [int(d) for d in np.diff(np.round(np.arange(len(images) + 1) * 1000 / (fps * unit)).astype(int) * unit)]
     kind, choices = ("GIF", {"optimize": False}) if gif else ("WEBP", {"quality": QUALITY, "method": 4})
     data = io.BytesIO()
-    try:
-        images[0].save(data, format=kind, save_all=True, append_images=images[1:], duration=durations, loop=0, **choices)
-    except (OSError, ValueError, KeyError) as e:
-        raise ResourceError(f"{path}: could not be encoded as {kind} by this Pillow ({e}); write .mp4 instead") from e
+    images[0].save(data, format=kind, save_all=True, append_images=images[1:], duration=durations, loop=0, **choices)
     write_bytes(path, data.getbuffer())
     return len(pixels)
 

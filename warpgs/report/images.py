@@ -1,14 +1,11 @@
 """Images of a report: colour maps, crops, sheets."""
 
-import io
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-
-from warpgs.errors import ResourceError
 
 GRAY = (0.5, 0.5, 0.5)
 PAGE_WIDTH = 1280
@@ -27,10 +24,7 @@ def png(image: np.ndarray) -> bytes:
 def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> bytes:
     import cv2
 
-    done, data = cv2.imencode(suffix, pixels, options)
-    if not done:
-        raise ResourceError(f"an image of {pixels.shape[1]} x {pixels.shape[0]} px could not be encoded as {suffix}")
-    return data.tobytes()
+    return cv2.imencode(suffix, pixels, options)[1].tobytes()
 
 
 def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) -> bytes:
@@ -108,14 +102,6 @@ def frame_sheet(frames: list[np.ndarray], columns: int = 3, gap: int = 4) -> np.
     return side_by_side([row.swapaxes(0, 1) for row in rows], gap).swapaxes(0, 1)
 
 
-def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
-    """Return the range of images [H, W, 3], mean over channels, [H, W]; of one image, its error to ``reference``."""
-    if len(images) == 1:
-        return np.abs(images[0] - reference).mean(-1)
-    stack = np.stack(images)
-    return (stack.max(0) - stack.min(0)).mean(-1)
-
-
 def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple[int, int]]:
     """Return corners (x, y) [px] of up to ``count`` disjoint crops with the largest sums of ``values`` [H, W]."""
     H, W = values.shape
@@ -123,18 +109,13 @@ def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple
     total = np.zeros((H + 1, W + 1))
     total[1:, 1:] = values.astype(np.float64).cumsum(0).cumsum(1)
     sums = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
-    found: list[tuple[int, int]] = []
     if not sums.max() > 1e-9:
-        found.append(((W - width) // 2, (H - height) // 2))
-    ys, xs = np.mgrid[: sums.shape[0], : sums.shape[1]]
-    while len(found) < count:
-        free = np.ones(sums.shape, bool)
-        for x, y in found:
-            free &= (np.abs(xs - x) >= width) | (np.abs(ys - y) >= height)
-        if not free.any():
-            break
-        at = int(np.argmax(np.where(free, sums, -1.0)))
-        found.append((int(xs.flat[at]), int(ys.flat[at])))
+        sums[(H - height) // 2, (W - width) // 2] = 1
+    found: list[tuple[int, int]] = []
+    while len(found) < count and sums.max() >= 0:
+        y, x = map(int, np.unravel_index(sums.argmax(), sums.shape))
+        found.append((x, y))
+        sums[max(0, y - height + 1) : y + height, max(0, x - width + 1) : x + width] = -1
     return found
 
 
@@ -160,70 +141,9 @@ def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> n
     return image
 
 
-INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)
-BOXES = ((240, 78, 35), (0, 158, 190), (240, 190, 0))
-"""Colours of the boxes, and of the frames of their crops."""
-MAX_WIDTH = 2600
-"""Largest width of a figure of many columns [px]; exceeded if columns would be narrower than `CELL` allows."""
-CELL = (180, 480)
-"""Smallest and largest width of a column [px]."""
-GAP, MARGIN, HEAD, CAPTION = 8, 20, 38, 32
-
-
-Strip = tuple[str, list[tuple[np.ndarray, str]], list[tuple[int, int, int, int]]]
-"""One row of a figure: title; colours [H, W, 3] in [0, 1] and caption of the image by each method, all of one size; crops to
-enlarge: x, y, width, height [px]."""
-
-
-def sheet(headings: list[str], strips: list[Strip]) -> bytes:
-    """Return a figure with a cell for each heading and strip as bytes of an RGB PNG; images have the width of a column."""
-    available = (MAX_WIDTH - 2 * MARGIN + GAP) // len(headings) - GAP
-    column = max(CELL[0], min(CELL[1], available, max(320, *(cells[0][0].shape[1] for _, cells, _ in strips))))
-    bold, small = (ImageFont.load_default(max(least, column / part)) for least, part in ((17, 22), (14, 30)))
-
-    def fitted(text: str, font) -> str:
-        while text and font.getlength(text) > column:
-            text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
-        return text
-
-    rows = []
-    for title, cells, boxes in strips:
-        H, W = cells[0][0].shape[:2]
-        inner = (column - GAP * (len(boxes) - 1)) // max(len(boxes), 1)
-        zoom = GAP + max(round(inner * h / w) for _, _, w, h in boxes) if boxes else 0
-        rows.append((title, cells, boxes, inner, round(column * H / W), zoom))
-    width = 2 * MARGIN + len(headings) * (column + GAP) - GAP
-    height = MARGIN + HEAD + sum(HEAD + tall + zoom + CAPTION for *_, tall, zoom in rows) + MARGIN // 2
-    canvas = Image.new("RGB", (width, height), PAPER)
-    draw = ImageDraw.Draw(canvas)
-    for i, heading in enumerate(headings):
-        draw.text((MARGIN + i * (column + GAP) + column / 2, MARGIN + 18), fitted(heading, bold), INK, bold, anchor="ms")
-    y = MARGIN + HEAD
-    for title, cells, boxes, inner, tall, zoom in rows:
-        draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))
-        draw.text((MARGIN, y + 10), title, SOFT, small)
-        y += HEAD
-        for i, (image, caption) in enumerate(cells):
-            x, factor = MARGIN + i * (column + GAP), column / image.shape[1]
-            canvas.paste(resized(image, column, tall), (x, y))
-            for k, (cx, cy, w, h) in enumerate(boxes):
-                color, high = BOXES[k % len(BOXES)], round(inner * h / w)
-                box = [x + cx * factor, y + cy * factor, x + (cx + w) * factor - 1, y + (cy + h) * factor - 1]
-                draw.rectangle([round(v) for v in box], outline=color, width=3)
-                left, top = x + k * (inner + GAP), y + tall + GAP
-                canvas.paste(resized(image[cy : cy + h, cx : cx + w], inner, high), (left, top))
-                draw.rectangle([left, top, left + inner - 1, top + high - 1], outline=color, width=3)
-            draw.text((x + column / 2, y + tall + zoom + 20), fitted(caption, small), SOFT, small, anchor="ms")
-        y += tall + zoom + CAPTION
-    out = io.BytesIO()
-    canvas.save(out, "PNG")
-    return out.getvalue()
-
-
 CONTACT_PAPER, CONTACT_INK, CONTACT_SOFT, CONTACT_LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
 LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
 CONTACT_MARGIN, CONTACT_GAP, CONTACT_HEAD = 28, 18, 30  # [px]; HEAD is the height of a label
-CONTACT_LEGEND = (72, 8)  # width and height of a colour bar [px]
 DOT = (240, 78, 35)
 """Colour of dots."""
 MAX_DOT_FRACTION = 0.08
@@ -237,11 +157,9 @@ class Tile:
     label: str
     """Name of the content, in a few words."""
     values: np.ndarray
-    """Colours [H, W, 3] in [0, 1], or values [H, W]."""
+    """Colours [H, W, 3], or values [H, W], both in [0, 1]."""
     colors: str = "INFERNO"
     """Colour map of values."""
-    largest: float = 1.0
-    """Value of the last colour of the map; the first is 0."""
     dots: np.ndarray | None = None
     """Rows and columns of pixels to mark, shape [S, 2]."""
 
@@ -250,7 +168,7 @@ def _tile_image(tile: Tile, size: tuple[int, int]):
     """Return a tile's pixels at a size (width, height) [px], as a Pillow image."""
     values = tile.values
     if values.ndim == 2:
-        values = colored(values / tile.largest, tile.colors)
+        values = colored(values, tile.colors)
     image = resized(values, *size)
     return image if tile.dots is None else _dotted(image, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
 
@@ -271,10 +189,11 @@ def _dotted(image, centers: np.ndarray):
 def contact_sheet(
     title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
 ) -> np.ndarray:
-    """Arrange labelled tiles of one size in rows, with colour bars of maps and lines of text; colours [rows, columns, 3]."""
+    """Arrange labelled tiles of one size in rows, with lines of text; colours [rows, columns, 3]."""
     height, width = tiles[0].values.shape[:2]
     tile_height = max(1, round(tile_width * height / width))
-    rows = -(-(len(tiles) + 1) // columns)
+    cells = len(tiles) + bool(lines)
+    rows = -(-cells // columns)
     label_size, text_size, title_size, head = (round(text * v) for v in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE, CONTACT_HEAD))
     top = CONTACT_MARGIN + title_size + 18
     across = 2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP
@@ -283,7 +202,7 @@ def contact_sheet(
     draw = ImageDraw.Draw(sheet)
     fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
     draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[title_size])
-    for i in range(len(tiles) + 1):
+    for i in range(cells):
         x = CONTACT_MARGIN + (i % columns) * (tile_width + CONTACT_GAP)
         y = top + (i // columns) * (head + tile_height + CONTACT_GAP)
         if i == len(tiles):
@@ -293,14 +212,7 @@ def contact_sheet(
             draw.multiline_text((x, y + head + 14), words, CONTACT_SOFT, fonts[text_size], spacing=5)
             break
         tile = tiles[i]
-        draw.text((x, y + head // 5), tile.label, CONTACT_INK, fonts[label_size])
+        label = tile.label[: int(tile_width / (0.5 * label_size))]
+        draw.text((x, y + head // 5), label, CONTACT_INK, fonts[label_size])
         sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + head))
-        if tile.values.ndim == 2:
-            middle, right = y + head // 2, x + tile_width
-            largest, small = f"{tile.largest:g}", fonts[text_size]
-            values = np.linspace(0, 1, CONTACT_LEGEND[0], dtype=np.float32)[None].repeat(CONTACT_LEGEND[1], 0)
-            left = right - round(draw.textlength(largest, small)) - 6 - CONTACT_LEGEND[0]
-            draw.text((right, middle), largest, CONTACT_SOFT, small, anchor="rm")
-            sheet.paste(_tile_image(Tile("", values, tile.colors), CONTACT_LEGEND), (left, middle - CONTACT_LEGEND[1] // 2))
-            draw.text((left - 6, middle), "0", CONTACT_SOFT, small, anchor="rm")
     return np.asarray(sheet, np.float32) / 255

@@ -34,33 +34,23 @@ def frusta(cameras: list[Camera], size: float) -> np.ndarray:
     return np.array(lines)
 
 
-def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: float) -> np.ndarray:
-    """Return eye, focal point and up vector [3, 3] of a view along ``-direction`` of all points ``shown`` [N, 3]."""
+def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return axes (right, down, forward) [3, 3] and position [3] of the nearest camera that looks so and sees all points."""
     length = np.linalg.norm(direction)
     forward = -direction / length if length > 0 else np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-3:
         right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-    axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
-    axes[1] = np.cross(axes[0], forward)
+    right = right / np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
     slope = np.tan(np.radians(VIEW_ANGLE / 2)) / 1.06
-    seen = np.ascontiguousarray((shown @ axes.T).T)
-    low, high = seen.min(1), seen.max(1)
-    eye, focus = (low + high) / 2, (low + high) / 2
-    eye[2] -= max(float((high - low).max()), 1e-6) * 2
-    half = (seen.shape[1] - 1) // 2, seen.shape[1] // 2
-    middles = np.partition(seen[2], half)[[*half]]  # whose mean is the median
-    for _ in range(20):  # move the camera until the content touches the edges: near content looks larger
-        depth = np.maximum(seen[2] - eye[2], 1e-9)
-        x, y = (seen[0] - eye[0]) / depth, (seen[1] - eye[1]) / depth
-        nearest, middle = float(depth.min()), float(np.maximum(middles - eye[2], 1e-9).mean())
-        (left, right), (top, bottom) = ((float(a.min()), float(a.max())) for a in (x, y))
-        size = max((bottom - top) / slope, (right - left) / (slope * aspect)) / 2
-        eye[:2] += 0.5 * middle * np.array([right + left, bottom + top]) / 2
-        eye[2] -= max((size - 1) * middle, -0.5 * nearest)
-    focus[:2] = eye[:2]
-    focus[2] = max(focus[2], eye[2] + 1e-6)
-    return np.stack([eye @ axes, focus @ axes, axes[1]])
+    eye, points = [], shown @ axes.T
+    for along, steep in ((0, slope * aspect), (1, slope)):
+        # two planes through the camera, each touched by a point
+        far, near = ((sign * points[:, along] - steep * points[:, 2]).max() for sign in (1, -1))
+        eye.append(((far - near) / 2, -(far + near) / (2 * steep)))
+    (x, back), (y, aside) = eye
+    return axes, np.array([x, y, min(back, aside) - 1e-6]) @ axes
 
 
 def within(points: np.ndarray, margin: float) -> np.ndarray:
@@ -91,10 +81,7 @@ def render_overview(
     lines = [(frusta(shown, far), color) for shown, color in kinds if shown]
     width, height = size
     shown = np.concatenate([core, *(segments.reshape(-1, 3) for segments, _ in lines)])
-    eye, focus, top = framing(shown, direction, up, width / height)
-    axis = (focus - eye) / np.linalg.norm(focus - eye)
-    right = np.cross(axis, top) / np.linalg.norm(np.cross(axis, top))
-    rotation = np.stack([right, np.cross(axis, right), axis])
+    rotation, eye = framing(shown, direction, up, width / height)
     viewmat = pose_of(rotation, -rotation @ eye)
     focal = height / 2 / math.tan(math.radians(VIEW_ANGLE / 2))
     camera = Camera(viewmat, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height)

@@ -28,13 +28,15 @@ def image_names(views: Iterable[str]) -> dict[str, str]:
     # ambiguous, longer than 100 bytes or not allowed on some system is shortened; digits of a hash of the whole name follow.
     own = {view: _own_name(view) for view in views}
     count = Counter(map(_folded, own.values()))
-    kept = {v: n for v, n in own.items() if count[_folded(n)] == 1 and not NOT_EVERYWHERE.search(n) and _size(n) <= MOST_BYTES}
-    for view, name in own.items():
-        if view in kept:
-            continue
+
+    def named(view: str, name: str) -> str:
+        size = len(name.encode("utf-8", "surrogatepass"))
+        if count[_folded(name)] == 1 and not NOT_EVERYWHERE.search(name) and size <= MOST_BYTES:
+            return name
         part = re.sub(r"[^\w.-]", "_", name).lstrip(".").encode("utf-8", "replace")[: MOST_BYTES // 2].decode("utf-8", "ignore")
-        kept[view] = f"{part}-{hashlib.sha256(view.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
-    return {view: kept[view] for view in own}
+        return f"{part}-{hashlib.sha256(view.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
+
+    return {view: named(view, name) for view, name in own.items()}
 
 
 def renaming_notes(names: dict[str, str]) -> list[str]:
@@ -54,10 +56,6 @@ def _folded(name: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
-def _size(name: str) -> int:
-    return len(name.encode("utf-8", "surrogatepass"))
-
-
 WIDTH, HEIGHT = 380, 190
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 26, 26
 MAX_POINTS = 300
@@ -70,13 +68,6 @@ def ticks(low: float, high: float) -> list[float]:
     step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough)
     first = math.ceil(low / step - 1e-9)
     return [i * step for i in range(first, first + 8) if i * step <= high + 1e-9 * step]
-
-
-def tick_label(value: float) -> str:
-    """Return a number as written on axes: 20000 becomes 20k."""
-    if abs(value) >= 1e6:
-        return f"{value / 1e6:g}M"
-    return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:g}"
 
 
 def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
@@ -101,9 +92,9 @@ def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
     for tick in ticks(y0, y1):
         _, py = place(x0, tick)
         head += f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py:.1f}" y2="{py:.1f}"/>'
-        head += f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>'
+        head += f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick:g}</text>'
     for tick in ticks(x0, x1):
-        head += f'<text x="{place(tick, y0)[0]:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick_label(tick)}</text>'
+        head += f'<text x="{place(tick, y0)[0]:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick:g}</text>'
     line = " ".join(f"{px:.1f},{py:.1f}" for px, py in (place(*p) for p in points))
     return f'{head}<polyline class="line" points="{line}"/></svg>'
 

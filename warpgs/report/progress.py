@@ -140,7 +140,7 @@ def waiting() -> Stages:
     return Stages(silent, live=is_live())
 
 
-class Progress:
+class Progress(contextlib.AbstractContextManager["Progress"]):
     """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left, as `Stages` does.
 
     Times exclude steps that compile kernels; no time is shown before the first step without compilation.
@@ -160,10 +160,6 @@ class Progress:
         """Time left [s]."""
         self.stages, self.count = Stages(live=live), 0
         self.loss = self.psnr = self.seconds = None
-
-    def __enter__(self) -> Progress:
-        """Begin."""
-        return self
 
     def __exit__(self, *error) -> None:
         """Print the last state."""

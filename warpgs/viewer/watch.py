@@ -37,12 +37,10 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
         read_record(path)
     elif path.suffix.lower() in (".html", ".htm") and path.is_file():
         raise DataError(f"{path}: is a web page; open this file in a browser")
-    elif not path.exists():
-        near = similar_folder(path) or "give a run folder or a file of Gaussians"
-        raise DataError(f"{path}: no such file or folder; {near}")
-    elif not any(kind.fits(path) for kind in all_formats()) or not path.is_file():
-        what = f"a run folder ({CONFIG} in it) nor a file of Gaussians ({', '.join(suffixes())})"
-        raise DataError(f"{path}: is neither {what}; give one of these")
+    elif not path.is_file() or not any(kind.fits(path) for kind in all_formats()):
+        what = "of no known format" if path.exists() else "no such file or folder"
+        fix = f"give a run folder ({CONFIG} in it) or a file of Gaussians ({', '.join(suffixes())})"
+        raise DataError(f"{path}: {what}; {similar_folder(path) or fix}")
     require_viser()
     with contextlib.suppress(KeyboardInterrupt):
         server = open_server(port)

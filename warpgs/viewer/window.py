@@ -214,7 +214,6 @@ class Panel:
         """Make the controls that are useful for the model."""
         self.server, self.content, self.window = server, content, window
         self.keyframes: list[dict[str, Any]] = []
-        self._lock = threading.Lock()
         gui = server.gui
         self._status = gui.add_markdown("")
         self.kind = gui.add_dropdown("show", (GAUSSIANS, *MAPS) if maps else (GAUSSIANS,), initial_value=GAUSSIANS)
@@ -351,17 +350,15 @@ class Panel:
             count.content = f"{len(self.keyframes)} keyframes" if self.keyframes else "no keyframe"
 
         def append(event: Any) -> None:
-            with self._lock:
-                if len(self.keyframes) >= MAX_KEYFRAMES:
-                    return self.explain(f"a path has at most {MAX_KEYFRAMES:,} keyframes")
-                at = self.keyframes[-1]["seconds"] + float(seconds.value) if self.keyframes else 0.0
-                self.keyframes.append(keyframe(self.window.camera_of(event.client), at, self.content.model.normalization))
-                changed()
+            if len(self.keyframes) >= MAX_KEYFRAMES:
+                return self.explain(f"a path has at most {MAX_KEYFRAMES:,} keyframes")
+            at = self.keyframes[-1]["seconds"] + float(seconds.value) if self.keyframes else 0.0
+            self.keyframes.append(keyframe(self.window.camera_of(event.client), at, self.content.model.normalization))
+            changed()
 
         def pop(_: Any) -> None:
-            with self._lock:
-                del self.keyframes[-1:]
-                changed()
+            del self.keyframes[-1:]
+            changed()
 
         def store(_: Any) -> None:
             if not self.keyframes:

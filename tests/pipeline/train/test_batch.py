@@ -16,7 +16,7 @@ from warpgs.errors import NotFiniteError, UsageError
 from warpgs.kernels.update import Setting, scheduled_lrs
 from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train import batch as train_slots, step
-from warpgs.pipeline.train.batch import BatchSteps, SlotSums, Tree, check_ranks, check_renders, own_slots
+from warpgs.pipeline.train.batch import BatchSteps, SlotSums, Tree, check_ranks, own_slots
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
@@ -120,8 +120,6 @@ def test_every_process_plans_the_same_memory_and_every_slot_is_in_one(batch, ran
 def test_a_process_without_a_view_is_refused():
     with pytest.raises(UsageError, match="give a multiple"):
         check_ranks(3, Thread(0, 4, [], threading.Barrier(1)))
-    with pytest.raises(UsageError, match="renders; lower --steps or --batch"):
-        check_renders(1000, 20_000)
 
 
 # Steps of several views.

@@ -409,7 +409,7 @@ def test_command_line_says_why_growth_stopped(scene, tmp_path, capsys):
     assert c["held_out"] and c["cap"] == 900 and c["count"] == metrics["gaussians"] <= 900
     assert f"{c['count']:,} Gaussians, " in words
     page = (tmp_path / "run" / "report.html").read_text()
-    assert "mean SH degree" in page and "growth ended at step" in page and "growth stopped because" in page
+    assert "mean SH degree" in page and "growth ended at step" in page and "end of growth: " in page
 
 
 # Held-out blocks, and when a gain on them is more than noise.

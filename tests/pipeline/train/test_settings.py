@@ -104,7 +104,6 @@ def test_a_file_starts_from_another(tmp_path):
     [
         ("stpes = 3", "my.toml: unknown setting 'stpes'; did you mean steps?"),
         ("[init]\nopacty = 3", "unknown setting 'init.opacty'; did you mean init.opacity?"),
-        ('strategy = "mcmc"\n[top-split]\nevery = 3', "unknown setting 'top_split.every'; did you mean mcmc.every?"),
         ('strategy = "mcmc"\n[densty]\nevery = 3', "unknown setting 'densty.every'; did you mean density.every?"),
         ("steps = 3.5", "steps must be a whole number of 64 bits, not 3.5"),
         ("steps = 0", "my.toml: steps must be at least 1, not 0"),
@@ -139,7 +138,7 @@ def test_a_wrong_setting_is_named(tmp_path, text, said):
         (b"steps = ", "not valid TOML"),
         (b"steps = 1\nseed = = 2", "at line 2"),
         (b"\xff\xfe", "not valid TOML"),
-        (b"x = " + b"[" * 5000 + b"]" * 5000, "nested deeper"),
+        (b"x = " + b"[" * 5000 + b"]" * 5000, "nested tables"),
         (b"#" * (MAX_BYTES + 1), "larger than"),
         (b"a = 1\n" + b"a." * (MAX_DOTS + 1) + b"a = 1", "more than 100 dots in a line"),
         (None, "cannot be read"),
@@ -355,8 +354,8 @@ def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):
     config, notes = chosen(views, device, view, **given)
     assert {name: value(config, name) for name in wanted} == wanted
     if not given:
-        assert ("one layer" in notes) != config.method.hier and ("no extrapolated points" in notes) != config.init.extrapolate
-        assert ("mean of the last 5% of the steps" in notes) == (config.optimizer.average_last > 0)
+        assert f"method.hier {config.method.hier}" in notes and f"init.extrapolate {config.init.extrapolate}" in notes
+        assert f"optimizer.average-last {config.optimizer.average_last}" in notes
     smooth = ["smooth_depth"] * (config.loss.smooth_weight > 0)
     assert [t.name for t in built_in_terms(config.loss)] == ["photometric", *smooth]
 

@@ -292,7 +292,7 @@ def test_the_state_before_is_kept_and_the_error_names_the_term(tmp_path):
     with pytest.raises(NotFiniteError) as again:
         warpgs.fit(scene, config, out=tmp_path / "run", resume=True, **run)
     assert str(again.value) == str(found.value)
-    with pytest.raises(NotFiniteError, match=told + r" To fix it, correct nan_later, and fit again$"):
+    with pytest.raises(NotFiniteError, match=told + r" To fix it, correct nan_later, and fit again into a new --out$"):
         warpgs.fit(scene, config, **run)
 
 

@@ -27,7 +27,6 @@ from warpgs.report.progress import Stages, duration
 WORKER = "warpgs.pipeline.farm.worker"
 SECONDS_TO_SAVE = 60.0
 """Time that a fit gets to save its state when the farm is stopped [s]."""
-MAX_SLOTS = 256
 
 
 Slot = tuple[str, int, dict[str, str]]
@@ -40,8 +39,6 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
 
     gpus = torch.cuda.device_count() if choose_device(device)[0].type == "cuda" else 0
     count = (gpus * per_gpu if gpus else 1) if slots is None else slots
-    if not 1 <= count <= MAX_SLOTS or not 1 <= per_gpu <= MAX_SLOTS:
-        raise UsageError(f"--slots and --per-gpu must be numbers from 1 to {MAX_SLOTS}, not {slots} and {per_gpu}")
     if gpus and count > gpus * per_gpu:
         raise UsageError(f"--slots {count}: {gpus} GPUs with --per-gpu {per_gpu} have {gpus * per_gpu}; give more --per-gpu")
     threads = max(1, torch.get_num_threads() // count)
@@ -283,14 +280,6 @@ def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
 STATES = ("waiting", "running", "elsewhere", "done", "failed")
 
 
-def row_values(row: JobRecord) -> tuple[str, ...]:
-    """Return the cells of a row: name, state, steps, time, PSNR, Gaussians, message."""
-    return (
-        row.name, row.state, f"{row.steps:,}" if row.steps else "", duration(row.seconds) if row.seconds else "",
-        "" if row.psnr is None else f"{row.psnr:.2f} dB", f"{row.gaussians:,}" if row.gaussians else "", row.message,
-    )  # fmt: skip
-
-
 def progress_line(statuses: list[JobStatus], slots: int, seconds: float) -> str:
     """Return the number of jobs that ended, the time left, the numbers by state, and the time that passed."""
     counts, left = Counter(s.state for s in statuses), seconds_left(statuses, slots)
@@ -300,17 +289,17 @@ def progress_line(statuses: list[JobStatus], slots: int, seconds: float) -> str:
 
 
 SHORT = 120
-"""Largest number of letters of a message on a card; the table of failures shows the whole message."""
+"""Largest number of letters on a card; the table of failures shows the whole message."""
 
 
 def _facts(row: JobRecord) -> str:
-    """Return a card's text: scores and sizes, the message of a failure, or the state."""
-    _, _, _, seconds, psnr, gaussians, message = row_values(row)
-    failed = row.state == "failed"
+    """Return what a line or a card tells of a job: scores and sizes, the message of a failure, or the state."""
+    if row.state == "failed":
+        return row.message
     facts = [
-        psnr and f"PSNR {psnr}", "" if row.ssim is None else f"SSIM {row.ssim:.3f}", gaussians and f"{gaussians} Gaussians",
-        format_bytes(row.ply_bytes) if row.ply_bytes else "", "" if failed else seconds,
-        textwrap.shorten(message, SHORT, placeholder=" ...") if failed else "",
+        "" if row.psnr is None else f"PSNR {row.psnr:.2f} dB", "" if row.ssim is None else f"SSIM {row.ssim:.3f}",
+        f"{row.gaussians:,} Gaussians" if row.gaussians else "", format_bytes(row.ply_bytes) if row.ply_bytes else "",
+        duration(row.seconds) if row.seconds else "", row.message,
     ]  # fmt: skip
     return ", ".join(filter(None, facts)) or row.state
 
@@ -340,7 +329,7 @@ def farm_page(title: str, cards: list[Card], seconds: float) -> str:
     ]  # fmt: skip
     left = len(rows) - states["done"] - states["failed"]
     line = f"{left:,} jobs are not done yet; load the page again later." if left else "All jobs have ended."
-    given = [(row, _facts(row), *paths) for row, *paths in cards]
+    given = [(row, textwrap.shorten(_facts(row), SHORT, placeholder=" ..."), *paths) for row, *paths in cards]
     return rendered("farm.html", title=title, line=line, figures=figures, failures=_failures(rows), cards=given)
 
 
@@ -365,16 +354,13 @@ def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None
     cards: list[Card] = []
     lines: list[tuple[object, ...]] = [COLUMNS]
     for status in statuses:
-        r, job, scene, row = status.record, status.job, status.job.request.scene.path, row_of(status)
+        job, scene, row = status.job, status.job.request.scene.path, row_of(status)
         files = [p if p.is_file() else None for p in (job.folder / THUMBNAIL, job.request.out / "report.html")]
         thumbnail, report = ("" if p is None else p.relative_to(folder).as_posix() for p in files)
         message = row.message.replace(f"{Path(scene).parent}{os.sep}", "")  # a page is sent
         cards.append((replace(row, message=message), thumbnail, report))
-        if r is None:
-            lines.append((job.name, scene, status.state, *[""] * (len(COLUMNS) - 3)))
-        else:  # csv writes None as an empty field
-            figures = r.psnr, r.ssim, r.gaussians, r.steps, r.ply_bytes, round(r.seconds, 3)
-            lines.append((r.name, scene, r.state, r.how, *figures, r.files.get(PLY, ""), r.message))
+        figures = row.psnr, row.ssim, row.gaussians, row.steps, row.ply_bytes, round(row.seconds, 3)
+        lines.append((row.name, scene, row.state, row.how, *figures, row.files.get(PLY, ""), row.message))
     write_text(folder / INDEX, farm_page(folder.resolve().name, cards, seconds))
     write_csv(folder / TABLE, lines)
 
@@ -392,8 +378,6 @@ def make_engine(
     """Make an engine by its name, with the options of `warpgs farm`."""
     if engine == "local":
         return LocalEngine(local_slots(device, slots, per_gpu))
-    if min(1 if slots is None else slots, per_gpu, threads, minutes) < 1:
-        raise UsageError("--slots, --per-gpu, --threads and --minutes must be at least 1")
     if engine == "ray":
         from warpgs.pipeline.farm.ray import RayEngine
 
@@ -422,7 +406,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
                 for status in statuses:
                     if status.ended and status.job.name not in told:
                         told.add(status.job.name)
-                        say("  ".join(filter(None, row_values(row_of(status)))))
+                        say(f"{status.job.name}  {status.state}  {_facts(row_of(status))}")
                 (say if last else stage)(progress_line(statuses, engine.slots, now - began))
                 shown = now
                 if now - written >= INDEX_INTERVAL or last:

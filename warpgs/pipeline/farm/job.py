@@ -187,7 +187,7 @@ def _flag(key: str, value: Any) -> str:
 RECORD = "job.json"
 LOG = "log.txt"
 """Name of the file with the output of a job."""
-THUMBNAIL = "thumbnail.jpg"
+THUMBNAIL = "thumbnail.webp"
 PLY = "point_cloud.ply"
 CHECKED = (PLY, "metrics.json", CONFIG)
 """Files of a run with a checksum in the record."""

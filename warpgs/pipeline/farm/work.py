@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from warpgs import files, schema
 from warpgs.device import is_out_of_memory, no_memory_message
 from warpgs.errors import DataError, FolderHeldError, UsageError, WarpgsError
@@ -30,6 +28,7 @@ from warpgs.pipeline.train.schedule import StepReport
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import output_to, say, say_lines
+from warpgs.report.images import webp
 from warpgs.version import __version__
 
 Outcome = tuple[str, dict[str, Any] | None, str]
@@ -126,8 +125,8 @@ def ensure_run(
         raise
 
 
-THUMBNAIL_SIDE = 480
-"""Longest side of a thumbnail, which shows a render beside the photograph [px]."""
+THUMBNAIL_WIDTH = 480
+"""Width of a thumbnail, which shows a render beside the photograph [px]."""
 
 
 def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object] | None = None) -> str:
@@ -198,15 +197,7 @@ def _wanted(request: FitRequest, device: str) -> tuple[str, Split | None, FitCon
 
 
 def write_thumbnail(renders: Path, path: Path) -> None:
-    """Write the first render of a run, if any, beside its photograph, as a small JPEG."""
-    import cv2
-
-    if (first := min(renders.glob("*.png"), default=None)) is None:
-        return
-    image = np.round(255 * decode(first, data=files.read_file(first, renders.parent))[0][..., ::-1]).astype(np.uint8)
-    pair = image[:, : image.shape[1] * 2 // 3]  # render, photograph, error
-    scale = min(1.0, THUMBNAIL_SIDE / max(pair.shape[:2]))
-    size = max(1, round(pair.shape[1] * scale)), max(1, round(pair.shape[0] * scale))
-    done, data = cv2.imencode(".jpg", cv2.resize(pair, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    if done:
-        files.write_bytes(path, data.tobytes())
+    """Write the first render of a run, if any, beside its photograph, as a small image."""
+    if (first := min(renders.glob("*.png"), default=None)) is not None:
+        image, *_ = decode(first, data=files.read_file(first, renders.parent))
+        files.write_bytes(path, webp(image[:, : image.shape[1] * 2 // 3], THUMBNAIL_WIDTH))  # render, photograph, error

@@ -61,12 +61,12 @@ def cut_advice(model: FittedModel, cameras: Sequence[Camera]) -> str:
     return f"{cut}; lower it, such as with --near {np.median(depths) / 100:.1g}" if share > 0.5 else ""
 
 
-def fault_notes(faults: list[str], remedy: str, nearer: str, cut: str = "") -> list[str]:
-    """Return a line for the user on each fault, with advice: ``nearer`` for frames outside photographs, else ``remedy``."""
+def fault_notes(faults: list[str], remedy: str, cut: str = "") -> list[str]:
+    """Return a line for the user on each fault, with its meaning and the ``remedy``."""
     advice = {
         NEARLY_NOTHING: cut or f"the path leaves the captured area; {remedy}",
         ARE_BLACK: f"the camera is inside geometry, or the scene is unlit; {remedy}",
-        ARE_OUTSIDE: f"expect artefacts there; {nearer}",
+        ARE_OUTSIDE: f"expect artefacts there; {remedy}",
     }
     frames = {fault: [i for i, f in enumerate(faults) if f == fault] for fault in advice}
     return [
@@ -86,8 +86,8 @@ MIN_FRAMES_PER_VIEW = 4
 MAX_FRAMES = 1_000_000
 WIDER = 1.02
 """A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
-EMPTY_VIEW = "score each view with `warpgs eval`"
-"""Advice for training views that show nothing."""
+AT_VIEWS = "score each view with `warpgs eval`; --coverage marks these places"
+"""Advice for frames at training views."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,9 @@ class FilmPlan:
     coverage: float
     """Fraction of a training view's pixels that the model covers; 0 if unknown."""
     remedy: str
-    """Advice for frames that show nothing."""
+    """Advice for frames that show nothing, or areas outside the photographs."""
     notes: list[str]
     """Lines for the user on the choices made."""
-    nearer: str = "move the cameras nearer to the photographs' cameras"
-    """Advice for frames that show areas outside the photographs."""
 
 
 @torch.no_grad()
@@ -194,15 +192,13 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
             raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
         shown = [(names[n], paths.framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
-        nearer = _nearer([c for _, c in shown], train, "--coverage marks these places")
-        return FilmPlan(shown, coverage, EMPTY_VIEW, _cropped(train[0], settings), nearer)
+        return FilmPlan(shown, coverage, AT_VIEWS, _cropped(train[0], settings))
     rig = paths.rig_of(train, depth, model.normalization.up)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
-        remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
-        nearer = _nearer(cameras, train, "move the keyframes nearer to the photographs' cameras")
-        return FilmPlan(_numbered(cameras), coverage, remedy, [words], nearer)
-    notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe(train)}"]
+        remedy = "move the keyframes nearer to the photographs; c2w is in OpenCV axes, in the units of the scene's files"
+        return FilmPlan(_numbered(cameras), coverage, remedy, [words])
+    notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
     if rig.turned:
         notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
     kind = paths.path_of(rig) if path == "auto" else path
@@ -212,14 +208,14 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         cameras, words = _tour(rig, far if left_out else train, settings)
         words += f"; {left_out} close-ups are left out" * bool(left_out)
         words += "; --path turntable is calmer" * (path == "auto" and rig.kind == "forward")
-        remedy, nearer = EMPTY_VIEW, "--coverage marks these places"
+        remedy = AT_VIEWS
     else:
         cameras = paths.camera_path(kind, rig, train, settings.count(SECONDS))
         words = f"path: {kind}" + ", there and back over the captured area" * (rig.span is not None and kind == "turntable")
-        remedy = nearer = "--path interpolate stays at the training views"
+        remedy = "--path interpolate stays at the training views"
     notes += _cropped(cameras[0], settings)
     cameras = [paths.framed(c, settings.size, settings.fov_y) for c in cameras]
-    return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], _nearer(cameras, train, nearer))
+    return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words])
 
 
 def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
@@ -228,24 +224,10 @@ def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
         return []
     camera = pinhole_of(camera)
     zooms = settings.size[0] / camera.width, settings.size[1] / camera.height
-    now, whole = (math.degrees(2 * math.atan(0.5 * settings.size[1] / (z * camera.K[1, 1]))) for z in (max(zooms), min(zooms)))
-    return [
-        f"frames have another shape than the photographs, and show {min(zooms) / max(zooms):.0%} of their "
-        f"{'height' if zooms[0] > zooms[1] else 'width'}; --fov {now:.0f} to {whole:.0f} shows more"
-    ] * (max(zooms) > WIDER * min(zooms))
-
-
-def _nearer(cameras: Sequence[Camera], train: Sequence[Camera], path: str) -> str:
-    """Return advice for frames that show areas outside the photographs: on size if the film is wider, else ``path``."""
-    (wide, high), photo = _field(cameras[0]), [_field(c) for c in train]
-    if min(wide, high) > WIDER * min(map(min, photo)) or max(wide, high) > WIDER * max(map(max, photo)):
-        return "keep the shape and the field of view of the photographs"
-    return path
-
-
-def _field(camera: Camera) -> tuple[float, float]:
-    """Return width and height of what a camera sees, as fractions of the depth."""
-    return camera.width / float(camera.K[0, 0]), camera.height / float(camera.K[1, 1])
+    whole = math.degrees(2 * math.atan(0.5 * settings.size[1] / (min(zooms) * camera.K[1, 1])))
+    shown = f"{min(zooms) / max(zooms):.0%} of their {'height' if zooms[0] > zooms[1] else 'width'}"
+    words = f"frames have another shape than the photographs, and show {shown}; --fov {whole:.0f} shows all"
+    return [words] * (max(zooms) > WIDER * min(zooms))
 
 
 def _numbered(cameras: list[Camera]) -> list[tuple[str, Camera]]:
@@ -301,14 +283,6 @@ def _frames(
         yield image, r.alpha.cpu().numpy(), fraction_outside(surface, camera, photographs, not model.transparent), covered
 
 
-def foreseen(model: FittedModel, plan: FilmPlan, settings: FilmSettings) -> list[str]:
-    """Return a line for the user if some frames of a film show areas outside all photographs, by a few small renders."""
-    every = max(1, len(plan.cameras) // SHEET_FRAMES)
-    few = [paths.framed(c, (c.width // 4, c.height // 4)) for _, c in plan.cameras[::every]]
-    count = sum(outside > OUTSIDE for _, _, outside, _ in _frames(model, few, settings, False))
-    return [f"{count} of {len(few)} frames looked at {ARE_OUTSIDE}: expect artefacts there; {plan.nearer}"] * bool(count)
-
-
 def render_film(
     model: FittedModel,
     plan: FilmPlan,
@@ -356,7 +330,7 @@ def render_film(
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
     cut = cut_advice(model, [c for _, c in plan.cameras]) if NEARLY_NOTHING in faults else ""
-    notes = [*notes, *plan.notes, *fault_notes(faults, plan.remedy, plan.nearer, cut)]
+    notes = [*notes, *plan.notes, *fault_notes(faults, plan.remedy, cut)]
     notes += [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
     return [*files, film] if one_size else files, notes
 
@@ -413,7 +387,7 @@ def render_path(
         plan = plan_film(model, path, settings)
     else:
         own = [convert_camera(c, model.normalization, units, "scene") for c in path]
-        plan = FilmPlan(_numbered(own), 0.0, "check the poses and the units of the cameras", [])
+        plan = FilmPlan(_numbered(own), 0.0, "move the cameras nearer to the photographs, and check their poses and units", [])
     files, notes = render_film(model, plan, Path(out), settings, coverage=coverage)
     for note in notes:
         say(f"warpgs: {note}", error=True)

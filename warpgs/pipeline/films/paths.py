@@ -69,16 +69,13 @@ class Rig:
     turned: bool
     """True if the photographs are rotated by a quarter turn, so that an upright film swaps width and height."""
 
-    def describe(self, cameras: list[Camera]) -> str:
+    def describe(self) -> str:
         """Return a phrase on the positions of the rig's cameras."""
         words = NAMES[self.kind]
         if self.span is None:
             return f"{words}, from all sides" if self.kind == "ring" else words
-        if self.kind == "forward":  # azimuths of cameras above each other are equal; the centre may be behind the subject
-            ways = np.array([[_unit(c.center - self.center) for c in cameras], [c.viewmat[2, :3] for c in cameras]])
-            widest = math.acos(np.clip((ways[:, :, None] * ways[:, None]).sum(-1).min(), -1, 1))
-            return f"{words}, over {math.degrees(widest):.0f} degrees"
-        return words if self.kind == "free" else f"{words}, over {math.degrees(self.span[1] - self.span[0]):.0f} of 360 degrees"
+        over = f", over {math.degrees(self.span[1] - self.span[0]):.0f} of 360 degrees"
+        return words + over * (self.kind in ("ring", "room"))
 
     def direction(self, azimuth: float, elevation: float) -> np.ndarray:
         """Return the unit vector [3] at an azimuth and an elevation [rad]."""
@@ -409,7 +406,8 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
 
 
 KEYFRAMES = schema.items(schema.fields({
-    "c2w": schema.items(schema.items(schema.number(), 4), 4), "fov_y": schema.number(0.01), "seconds": schema.number(0.0),
+    "c2w": schema.items(schema.items(schema.number(), 4), 4),
+    "fov_y": schema.number(0.01, high=3.1), "seconds": schema.number(0.0),
 }))  # fmt: skip
 
 
@@ -433,8 +431,6 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         if not rigid or np.abs(matrix[:3, 3]).max() > MAX_REACH:
             fix = f"its upper left 3 x 3 a rotation, its last column within {MAX_REACH:g}, and its last row 0 0 0 1"
             raise DataError(f"{path}: c2w of keyframe {i} must be a rigid camera-to-world matrix: {fix}")
-        if value["fov_y"] > 3.1:
-            raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
             raise DataError(f"{path}: keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} s after the last; sort by time")
         viewmat = geometry.pose_at(geometry.nearest_rotation(rotation).T, matrix[:3, 3])

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from warpgs.device import in_background
+from warpgs.errors import listed
 from warpgs.geometry import back_project, inverse, matmul, project_points
 from warpgs.io.images import dark_pixels, without_masked
 from warpgs.kernels.ssim import RADIUS, ssim
@@ -455,6 +456,5 @@ def moved_fractions(views: Sequence[View], renders: Iterable[tuple[np.ndarray, n
 def moved_notes(fractions: dict[str, float]) -> list[str]:
     """Return a note that names the views with moved regions, the largest fraction of moved pixels first; empty without any."""
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
-    words = ", ".join(f"{name} ({f:.1%} of its pixels)" for f, name in named[:6])
-    more = f" and {len(named) - 6} more" if len(named) > 6 else ""
-    return [Task(f"something may have moved in {words}{more}: look, and mask it out")] if named else []
+    words = listed([f"{name} ({f:.1%} of its pixels)" for f, name in named], 6)
+    return [Task(f"something may have moved in {words}: look, and mask it out")] if named else []

@@ -1,7 +1,6 @@
 """Edits of a finished model: filters and compression."""
 
 import itertools
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpgs import schema
 from warpgs.constants import ALPHA_CUT
 from warpgs.errors import DataError, UsageError
 from warpgs.files import read_input, unread_reason
@@ -122,37 +122,29 @@ def numbers_of(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     return array
 
 
+_THREE = schema.items(schema.number(), 3)
+BOX = schema.fields({"center": _THREE, "size": _THREE}, {"rotation": schema.items(_THREE, 3)})
+"""Schema of a box in a file."""
+
+
 def box_of(text: str) -> Box:
-    """Return the box of a text: least and largest corner, x,y,z,X,Y,Z; JSON with center, size, rotation; or a .json file."""
+    """Return the box of a text: least and largest corner, x,y,z,X,Y,Z; or a .json file, as the viewer saves it."""
     if text.lower().endswith(".json"):
-        return _box_of_file(Path(text))
-    try:
-        value = json.loads(text if text.lstrip().startswith("{") else f"[{text}]")
-    except (ValueError, RecursionError) as e:
-        forms = "six numbers separated by commas, JSON with center and size, or a .json file"
-        raise UsageError(f"--crop {text[:60]}: give {forms}") from e
-    if isinstance(value, list):
-        low, high = numbers_of(value, (6,), "--crop: a box").reshape(2, 3)
-        center, size, rotation = (low + high) / 2, high - low, np.eye(3)
+        try:
+            values = schema.parse(read_input(Path(text), MAX_BOX_BYTES))
+            BOX(values, "the box")
+        except (OSError, schema.SchemaError) as e:
+            raise DataError(f"{text}: cannot be read as a box ({unread_reason(e)}); save the box again in the viewer") from e
+        center, size = np.array(values["center"], np.float64), np.array(values["size"], np.float64)
+        rotation = np.array(values.get("rotation", np.eye(3)), np.float64)
     else:
-        center, size = (numbers_of(value.get(key), (3,), f"--crop: {key}") for key in ("center", "size"))
-        rotation = numbers_of(value.get("rotation", np.eye(3).tolist()), (3, 3), "--crop: rotation")
+        low, high = numbers_of(text.split(","), (6,), "--crop: a box (x,y,z,X,Y,Z, or a .json file)").reshape(2, 3)
+        center, size, rotation = (low + high) / 2, high - low, np.eye(3)
     if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > 1e-3:
-        raise UsageError("--crop: rotation must be a rotation matrix: its columns are not perpendicular, or not of length 1")
+        raise UsageError(f"--crop {text[:60]}: rotation must be a rotation matrix: its columns perpendicular and of length 1")
     if not (size > 0).all():
         raise UsageError(f"--crop: the box has sides of {', '.join(f'{s:g}' for s in size)}; each must be longer than 0")
     return center, size, rotation
-
-
-def _box_of_file(path: Path) -> Box:
-    """Return the box of a JSON file, as the viewer saves it; DataError if the file has no box."""
-    try:
-        text = read_input(path, MAX_BOX_BYTES).decode("utf-8-sig")
-        if not text.lstrip().startswith("{"):
-            raise UsageError("expected a JSON object with center and size")
-        return box_of(text)
-    except (OSError, UnicodeDecodeError, UsageError) as e:
-        raise DataError(f"{path}: cannot be read as a box ({unread_reason(e)}); save the box again in the viewer") from e
 
 
 def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
@@ -190,11 +182,6 @@ def floaters(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[s
     reasons[LARGE] = longest > math.log(size)
     reasons[NEEDLES] = needle & (longest > math.log(NEEDLE_LENGTH * size))
     return reasons
-
-
-def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Return the `floaters`, each under its first reason alone."""
-    return first_reasons(floaters(gaussians, maxima))
 
 
 def first_reasons(reasons: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -171,8 +171,6 @@ def shape_figures(
 def shape_summary(f: dict[str, Any]) -> str:
     """Return the values of `shape_figures` as one line for the user."""
     return (
-        f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius, {f['largest_over_extent']:.2g} of "
-        f"the cameras' extent, and {f['largest_over_distance']:.2g} of the distance to the nearest camera; {f['needles']:.1%} "
-        f"of the Gaussians are needles, more than {NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); "
-        f"{f['beyond']:,} exceed the limits"
+        f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius; {f['needles']:.1%} of the Gaussians "
+        f"are needles, more than {NEEDLE:g} times as long as wide; {f['beyond']:,} exceed the limits"
     )

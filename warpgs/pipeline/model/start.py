@@ -222,8 +222,7 @@ def consistent_points(
             if len(extrapolated):
                 notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks"
             elif config.extrapolate:
-                why = ", because masks, alpha or a black background hide parts" * (not depth_points.all_count(views))
-                notes[-1] += f", none extrapolated{why}"
+                notes[-1] += ", none extrapolated (masks, alpha and black backgrounds hide parts)"
             how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
             return Start(depth_points.joined((cloud, extrapolated)), how, depths, len(extrapolated))
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"

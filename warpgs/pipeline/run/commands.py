@@ -31,7 +31,7 @@ from warpgs.pipeline.metrics.scores import Renders, counted_region, psnr, render
 from warpgs.pipeline.model import edit
 from warpgs.pipeline.model.clean import chosen_reasons, counted_lines, in_colors, reasons_of
 from warpgs.pipeline.model.edit import coverage
-from warpgs.pipeline.model.start import InitConfig, consistent_depths, seen_points
+from warpgs.pipeline.model.start import InitConfig, consistent_depths, isotropic, seen_points
 from warpgs.pipeline.model.table import FittedModel, model_bytes, pack
 from warpgs.pipeline.paper.scores import CURVATURE, geometry_score, semantic_score
 from warpgs.pipeline.run.folder import CONFIG, IMAGE_FOLDERS, StoredRun, camera_values, open_run, save_checkpoint, with_cameras
@@ -142,10 +142,8 @@ def evaluate(
     if not test:
         return [*lines, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB{over_region(metrics)}"]
     for row in metrics["views"]:
-        kinds = {"alpha_empty": "where empty", "alpha_object": "in the object"}
-        alphas = [f", alpha {row[k]:.3f} {words}" for k, words in kinds.items() if not math.isnan(row.get(k, math.nan))]
         region = "" if row["region"] == "all" else f" (over {row['region']})"
-        lines.append(f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}{''.join(alphas)}{region}")
+        lines.append(f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}{region}")
     lines += coverage_lines(metrics["coverage"]) if by_coverage else []
     return [*lines, f"mean of {len(test)} held-out views: {score_line(metrics['test'])}"]
 
@@ -177,8 +175,6 @@ def render(
     told = not alone and any(p.is_file() for p in (out / film.FILM, *home.glob(f"path-*/{film.FILM}")))
     if one_size and not told and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
         say(VP9)
-    for line in film.foreseen(stored, plan, settings):
-        say(line)
     if coverage:
         try:
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
@@ -368,9 +364,7 @@ def _points(cloud: PointCloud, device: torch.device) -> Gaussians:
     low, high = np.percentile(cloud.points, [5, 95], axis=0)
     size = POINT_SIZE * max(float(np.linalg.norm(high - low)), 1e-6)
     means, colors = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (cloud.points, cloud.colors))
-    quats = torch.nn.functional.pad(means.new_ones(len(means), 1), (0, 3))
-    scales, opacities = torch.full_like(means, math.log(size)), means.new_full((len(means),), 6.0)
-    return Gaussians(means, quats, scales, opacities, base_coefficients(colors)[:, None])
+    return isotropic(means, colors, means.new_full((len(means),), math.log(size)), means.new_full((len(means),), 6.0), 1)
 
 
 def _by_coverage(gaussians: Gaussians, train: list[Camera], options: RasterizeOptions) -> Gaussians:

@@ -62,7 +62,7 @@ def filtered(
         maxima = None
         if stored is not None:  # the largest blending weight of each Gaussian over the training views
             maxima = edit.coverage(stored.gaussians(), training_cameras(stored), stored.options())[0]
-        removed = edit.disturbing(gaussians, maxima)
+        removed = edit.first_reasons(edit.floaters(gaussians, maxima))
         counts = {reason: int((where & keep).sum()) for reason, where in removed.items()}
         if words := [f"{count:,} {reason}" for reason, count in counts.items() if count]:
             lines.append(f"removed Gaussians: {', '.join(words)} (--no-clean keeps them)")
@@ -273,11 +273,8 @@ def mesh(
         options = replace(options, crop=box)
 
     def planned(plan: GridPlan, memory: str) -> None:
-        lost = f"{100 * (1 - plan.inside):.1f} %"
-        say(
-            f"grid: {' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {_unit(run)}"
-            + (f"; {lost} of the observed surface is outside the grid and left out" if lost != "0.0 %" else "")
-        )
+        size = f"{' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {_unit(run)}"
+        say(f"grid: {size}; {1 - plan.inside:.1%} of the observed surface is outside the grid and left out")
 
     ahead = _ahead(run)
     with hold_file(target) as notes:

@@ -31,7 +31,7 @@ from warpgs.pipeline.run import folder as folders, results
 from warpgs.pipeline.run.folder import CONFIG, METRICS_FILE, POSED_SCENE, TENSORS
 from warpgs.pipeline.run.precompile import compiled_ahead
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
-from warpgs.pipeline.train.batch import check_ranks, check_renders, own_slots
+from warpgs.pipeline.train.batch import check_ranks
 from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.memory import plan_summary
 from warpgs.pipeline.train.presets import chosen_settings
@@ -201,12 +201,11 @@ def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) 
     own = [t.name for t in trainer.terms if f"the loss term {t.name}" in broken and not is_ours(type(t))]
     text = f"{error}, on {job.split.train[view]}{', in ' if broken else ''}{' and '.join(broken)}; "
     text += f"not finite: {', '.join(tensors)}" if tensors else "all of its inputs and renders are finite"
-    fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
-    report = "" if own else "; if that fails, report this message"
     if job.out is not None:
         text += f". The state before the step is saved in {job.out}, and --resume would fail at the same step"
-        fix, report = f"{fix} into a new --out", report and f"{report} and {job.out / CONFIG}"
-    return NotFiniteError(f"{text}. To fix it, {fix}{report}")
+    fix = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
+    report = "" if own else f"; if that fails, report this message and the run's {CONFIG}"
+    return NotFiniteError(f"{text}. To fix it, {fix} into a new --out{report}")
 
 
 def non_finite_parts(trainer: Trainer, view: int, slot: int) -> tuple[list[str], list[str]]:
@@ -234,27 +233,25 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
     """Refuse, in every process, ranks whose scene, settings, code or checkpoint (``step``) differ from those of rank 0."""
     if ranks.count == 1:
         return
-    parts = {
-        "a different version of warpgs": (record["versions"]["warpgs"], "install the same version everywhere"),
-        "a different scene": (record["fingerprint"], "give all ranks the same files and options for reading"),
-        "a different split": ([record["train"], record["test"]], "give all ranks the same --split"),
-        "different settings": ([record["config"], record["own_code"]], "start all ranks with the same flags and the same code"),
-        "a different checkpoint": (step, "give all ranks the same --out, on a file system that all machines share"),
+    own = {
+        "the version of warpgs": record["versions"]["warpgs"],
+        "the scene": record["fingerprint"],
+        "the split": [record["train"], record["test"]],
+        "the settings or the code": [record["config"], record["own_code"]],
+        "the checkpoint": step,
     }
-    first, *others = map(json.loads, ranks.texts(json.dumps({name: value for name, (value, _) in parts.items()})))
+    first, *others = map(json.loads, ranks.texts(json.dumps(own)))
     for rank, other in enumerate(others, 1):
-        for name, (_, fix) in parts.items():
-            if other.get(name) != first.get(name):
-                raise UsageError(f"rank {rank} has {name} than rank 0: {fix}")
+        if names := [name for name in own if other.get(name) != first.get(name)]:
+            fix = "give all ranks the same version, files, flags, code and --out, on a file system that all machines share"
+            raise UsageError(f"rank {rank} differs from rank 0 in {names[0]}: {fix}")
 
 
 def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     """Return sentences on views and processes of a step; empty if a step has one view."""
     rates = f"learning rates are {config.batch**0.5:.3g} times those for one view"
     views = f"batch: each of the {config.steps:,} steps renders {config.batch} views and averages their gradients; {rates}"
-    counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
-    each = f"each renders {' or '.join(map(str, counts))} views of a step; the model has the same bits for any number of ranks"
-    processes = f"ranks: {ranks.count} processes ({ranks.backend}); {each}"
+    processes = f"ranks: {ranks.count} processes ({ranks.backend}) share the views; the model has the same bits for any number"
     return [views] * (config.batch > 1) + [processes] * (ranks.count > 1)
 
 
@@ -483,7 +480,6 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
     job.notes += [*([background] if background else []), *chosen]
     if job.config.antialiased:
         job.notes.append("antialiased: other programs must use their antialiased mode to show exported files correctly")
-    check_renders(job.config.batch, job.config.steps or 0)
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:

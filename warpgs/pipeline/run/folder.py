@@ -248,10 +248,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         record = schema.read(path, folder)
     except (FileNotFoundError, NotADirectoryError) as e:
-        lack, near = f"holds no run ({CONFIG} is missing)", ""
-        if not folder.is_dir():
-            lack = "is a file, not the folder of a run" if folder.is_file() else "no such folder"
-            near = similar_folder(folder)
+        lack = f"not the folder of a run ({CONFIG} is missing)" if folder.exists() else "no such folder"
+        near = similar_folder(folder) if not folder.exists() else ""
         raise DataError(f"{folder}: {lack}; {near or 'give a folder that `warpgs fit --out` filled'}") from e
     except (OSError, SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
@@ -281,7 +279,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 SAME = {
     "fingerprint": "the scene (its images, cameras, points or maps, or a flag that changes them, like --downscale)",
     "train": "the set of training views", "test": "the set of held-out views", "config": "config", "device": "device",
-    "own_code": "the code",
+    "own_code": "your own code",
 }  # fmt: skip
 """Parts of config.json that stay the same in a continued run, as text for the user."""
 
@@ -297,16 +295,10 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
         then = stored.get(key, {})
         if now == then:
             continue
-        if key == "own_code":
-            fix = "or the run did not record its version; restore the code, or give a new --out"
-            raise UsageError(f"--resume: the code of {', '.join(now or then)} has changed since the run in {out} began, {fix}")
         if isinstance(now, dict):
             words += f" ({', '.join(k for k in now | then if now.get(k) != then.get(k))})"
-        scene = record["scene"].items() if key != "device" else ()
-        was = [f"{k} was {stored['scene'].get(k)}" for k, v in scene if k != "path" and stored["scene"].get(k) != v]
-        were = f" ({', '.join(was)})" if was else ""
-        fix = f"give only --out {shlex.quote(str(out))} --resume; for other flags, give a new --out"
-        raise UsageError(f"--resume: {words} differs from the run in {out}{were}. To continue with the run's own flags, {fix}")
+        fix = f"give only --out {shlex.quote(str(out))} --resume; for other flags or code, give a new --out"
+        raise UsageError(f"--resume: {words} differs from the run in {out}. To continue with the run's own flags, {fix}")
 
 
 def _check_lost(stored: dict[str, Any], out: Path) -> None:
@@ -324,8 +316,6 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
         if key == "config" and isinstance(found, dict):
             found = upgraded(found)[0]
         if found != wanted:
-            if isinstance(found, dict) and isinstance(wanted, dict):
-                key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
             raise DataError(f"--resume: {key} differs between {out / TENSORS} and {CONFIG}; restore both, or fit again")
 
 

@@ -27,7 +27,6 @@ from warpgs.pipeline.films.paths import Rig, midways, rig_among
 from warpgs.pipeline.metrics.coverage import coverage_map, coverage_section, depth_views
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.scores import Renders, baselines, psnr_of, score, summarize, variants
-from warpgs.pipeline.paper.scores import SUPPORT
 from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.sampling import SampledView, Sampling
@@ -41,7 +40,7 @@ from warpgs.report.images import Tile, contact_sheet, depth_map, error_map, png,
 from warpgs.report.overview import render_overview
 from warpgs.report.page import Section, curve, image_names, write_page
 from warpgs.report.progress import duration, read_events
-from warpgs.scene import Camera, Gaussians, Scene, View
+from warpgs.scene import Camera, Gaussians, Render, Scene, View
 
 GIVEN = {
     "given_depth": ("depth", "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})"),
@@ -98,15 +97,11 @@ def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, i
     return x, y, min(SIDE, camera.width - x), min(SIDE, camera.height - y)
 
 
-def _milliseconds(render: Callable[[], object], device: torch.device) -> float:
+def _milliseconds(render: Callable[[], Render]) -> float:
     """Return the wall time of the second of two calls [ms]: the first loads kernels and allocates."""
     for _ in range(2):
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
         began = time.perf_counter()
-        render()
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
+        render().rgb.sum().item()  # waits for the device
     return 1000 * (time.perf_counter() - began)
 
 
@@ -118,7 +113,7 @@ def rule_report_of(
     # Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule
     # `exact` in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if
     # `warpgs.geometry` does not have the camera model.
-    generator, device = np.random.default_rng(seed), gaussians.means.device
+    generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
     assert options.background is not None
     options = replace(options, background=options.background.to(gaussians.means))
@@ -134,10 +129,10 @@ def rule_report_of(
     result = {
         "rule": options.rule, "max": float(error.max()), "mean": float(error.mean()), "psnr": psnr_of(float((error**2).mean())),
         "views": {n: list(w) for n, w in windows.items()}, "half_resolution": half_resolution,
-        "render_ms": _milliseconds(lambda: rasterize(gaussians, camera, options), device),
+        "render_ms": _milliseconds(lambda: rasterize(gaussians, camera, options)),
     }  # fmt: skip
     if options.rule != "exact":
-        result["exact_ms"] = _milliseconds(lambda: rasterize(gaussians, camera, exact), device)
+        result["exact_ms"] = _milliseconds(lambda: rasterize(gaussians, camera, exact))
     return result | {"summary": _summary(result)}
 
 
@@ -156,20 +151,14 @@ def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], 
 
 def _summary(r: dict[str, Any]) -> str:
     """Return the figures as one sentence for the user."""
-    sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
-    where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
-    error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
+    error = (
+        f"{r['mean']:.1e} on average, {r['max']:.1e} at most, {r['psnr']:.0f} dB, on parts of {len(r['views'])} training views"
+    )
     words = f"rule exact has the cut-offs of 3DGS (docs/conventions.md); within them, float32 differs from float64 by {error}"
     if r["rule"] != "exact":
-        ratio = r["render_ms"] / r["exact_ms"]
-        words = (
-            f"images by rule {r['rule']} differ from images by rule exact in float64 by {error}; a view took "
-            f"{r['render_ms']:.1f} ms, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'} than with rule exact "
-            f"({r['exact_ms']:.1f} ms)"
-        )
-    if r["half_resolution"] > 0:
-        words += f"; {r['half_resolution']:.0%} of the steps used views of half size, with a quarter of the pixels"
-    return words
+        words = f"images by rule {r['rule']} differ from images by rule exact in float64 by {error}; a view took "
+        words += f"{r['render_ms']:.1f} ms, and {r['exact_ms']:.1f} ms with rule exact"
+    return words + f"; {r['half_resolution']:.0%} of the steps used views of half size" * (r["half_resolution"] > 0)
 
 
 FOLDER = "sampling"
@@ -211,16 +200,10 @@ def view_sheet(
         Tile("sampled pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
         *(Tile(n, score) for n, score in scores.items()),
     ]
-    asked = strategy.asked_quantile
-    widened = f"; too few passed at the {asked:g} quantile" if sampled.quantile < asked else ""
     lines = [
         f"{len(at):,} pixels sampled of the {gate.sum():,} that pass the gate, {gate.mean():.0%} of the view.",
-        f"Gate: {_open_pixels(strategy, view.consistent is not None, sampled.quantile)}{widened}.",
+        f"Gate: {_open_pixels(strategy, view.consistent is not None, sampled.quantile)}.",
     ]
-    if scores:
-        score = [*scores.values()][-1]
-        mean = score[at[:, 0], at[:, 1]].mean() if len(at) else 0
-        lines.append(f"Mean importance: {mean:.2f} at the sampled pixels, {score.mean():.2f} over the view.")
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
@@ -289,22 +272,14 @@ def sampling_report_of(fit: Trainer, out: Path) -> Section | None:
     events, layers = figures["events"], figures["layers"]
     if not events["count"]:
         return None
-    how, after = "sampled uniformly at random", "All scores have weight 0, so no score is shown."
-    if strategy.scored:
-        how = "sampled at random in proportion to S_importance"
-        after = "S_importance is the weighted sum of the three scores; each score is shown below its source."
+    how = "sampled at random in proportion to S_importance" if strategy.scored else "sampled uniformly at random"
     if not strategy.at_random:
         how = "the highest in S_importance"
     depth = "consistent" if strategy.consistent else "rendered"
     words = (
         f"Each dot is a pixel behind which a fine Gaussian was added at the {depth} depth, while the layer had capacity. These "
-        f"pixels are {how}, among {_open_pixels(strategy, True, strategy.asked_quantile)} (the gate). {after}"
+        f"pixels are {how}, among {_open_pixels(strategy, True, strategy.asked_quantile)} (the gate)."
     )
-    if events["widened"]:
-        words += (
-            f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened, because fewer than "
-            f"{SUPPORT} candidates for each sample passed at the {strategy.asked_quantile:g} quantile."
-        )
     table = [
         ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],
         [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,57 +20,64 @@ from warpgs.pipeline.farm.farm import make_engine, run_and_show
 from warpgs.pipeline.farm.job import PLY, FarmJob
 from warpgs.pipeline.farm.work import Outcome, ensure_run
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.metrics.scores import over_white, render_view
+from warpgs.pipeline.metrics.scores import render_view
 from warpgs.pipeline.paper.strategy import UNIFORM, PaperConfig
 from warpgs.pipeline.run.folder import open_run, versions
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import LABELS, summary_line
 from warpgs.pipeline.study import tables
-from warpgs.pipeline.study.tables import GAUSSIANS, METRICS, Sample, Table, paired_difference, sample
+from warpgs.pipeline.study.tables import GAUSSIANS, Sample, Table, paired_difference, sample
 from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
 from warpgs.process import say, say_lines
-from warpgs.report.images import Strip, crops, disagreement, sheet
+from warpgs.report.images import Tile, contact_sheet, crops, png
 from warpgs.scene import Scene, View
+from warpgs.schema import Checked, Within
 
 CROPS = 2
 """Enlarged parts of each view."""
 FRACTION = 0.22
 """Width and height of a crop, as fractions of the width and height of the image."""
+MAX_WIDTH, CELL = 2600, (180, 440)
+"""Largest width of the figure of many variants, and the smallest and largest width of a column [px]."""
+BOXES = ((0.94, 0.31, 0.14), (0.0, 0.62, 0.75))
+"""Colours of the frames of the enlarged parts."""
 
 
-def strips(
+def view_sheets(
     title: str,
     views: list[View],
     folders: dict[str, Path],
     scores: dict[str, dict[str, float]],
     count: int,
     device: torch.device,
-) -> list[Strip]:
-    """Return rows of the figure of one scene: up to ``count`` held-out views on which the variants' PSNR [dB] differs most."""
+) -> list[np.ndarray]:
+    """Return sheets of up to ``count`` held-out views of a scene on which the variants' PSNR [dB] differs most."""
+    import cv2
+
     images = {}
     for name, folder in folders.items():
         run = open_run(folder, device)
         images[name] = [np.clip(render_view(run.gaussians(), v, run.options())[0], 0, 1) for v in views]
     maps = []
     for i, view in enumerate(views):
-        values = disagreement([p[i] for p in images.values()], view.image)
-        maps.append(values if view.score_mask is None else values * view.score_mask)
-    rows: list[Strip] = []
+        spread = np.ptp([rendered[i] for rendered in images.values()], axis=0).mean(-1)
+        maps.append(spread if view.score_mask is None else spread * view.score_mask)
+    sheets, width = [], max(CELL[0], min(CELL[1], MAX_WIDTH // (len(images) + 1)))
     for i in sorted(sorted(range(len(views)), key=lambda i: -float(maps[i].mean()))[:count]):
-        view, reference, words = views[i], views[i].image, "held-out image"
-        if view.score_mask is not None:
-            reference = over_white(reference, view.score_mask) * 0.5 + reference * 0.5
-            words = "image, bleached where not scored"
+        view = views[i]
         w, h = (max(8, round(FRACTION * side)) for side in (view.image.shape[1], view.image.shape[0]))
-        cells = []
-        for name, rendered in images.items():
-            value = scores[name].get(view.name)  # None if infinite
-            cells.append((rendered[i], "" if value is None else f"{value:.2f} dB"))
-        boxes = [(x, y, w, h) for x, y in crops(maps[i], w, h, CROPS)]
-        rows.append((f"{title}, {view.name}", [*cells, (reference, words)], boxes))
-    return rows
+        values = {n: scores[n].get(view.name) for n in images}  # None if infinite
+        labels = [*(n if v is None else f"{v:.2f} dB, {n}" for n, v in values.items()), "held-out image"]
+        shown = [np.array(image, np.float32) for image in (*(rendered[i] for rendered in images.values()), view.image)]
+        boxes = crops(maps[i], w, h, CROPS)
+        for image, ((x, y), color) in product(shown, zip(boxes, BOXES)):
+            cv2.rectangle(image, (x, y, w, h), color, max(1, w // 50))
+        tiles = [Tile(label, image) for label, image in zip(labels, shown)]
+        tiles += [Tile("enlarged", image[y : y + h, x : x + w]) for x, y in boxes for image in shown]
+        sheets.append(contact_sheet(f"{title}, {view.name}", [], tiles, columns=len(shown), tile_width=width))
+    return sheets
 
 
 SWITCHES = {
@@ -87,14 +94,14 @@ FILES = ("table.md", "table.csv", "table.tex", "runs.csv", "plot.svg", "figure.p
 
 
 @dataclass(frozen=True)
-class StudyRequest:
+class StudyRequest(Checked, group="--"):
     """A comparison: settings, scenes and seeds."""
 
     scenes: tuple[SceneRequest, ...]
     """Scenes that every variant is fitted to."""
     variants: dict[str, FitConfig]
     """Settings by name; each is compared with the first one. The study sets the seed."""
-    seeds: int
+    seeds: Annotated[int, Within(1, MAX_SEEDS)]
     """Number of runs of each variant on each scene, with seeds from 0 on."""
     out: Path
     """Folder of the study; its runs are in SCENE/VARIANT/SEED."""
@@ -108,8 +115,7 @@ class StudyRequest:
     """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.seeds <= MAX_SEEDS:
-            raise UsageError(f"--seeds must be a number from 1 to {MAX_SEEDS}, not {self.seeds}")
+        super().__post_init__()
         if len(self.variants) < 2:
             raise UsageError(f"a comparison needs at least two settings, not {', '.join(self.variants) or 'none'}")
         if not (names := [scene_name(s) for s in self.scenes]):
@@ -193,8 +199,8 @@ def _figure(request: StudyRequest, runs: Runs, places: Places, device: torch.dev
             folders = {v: run_folder(request, name, v, seed) for v in request.variants}
             found = {v: runs[name, v, seed][1] or {} for v in request.variants}
             scores = {v: {r["name"]: r["psnr"] for r in metrics["views"]} for v, metrics in found.items()}
-            rows += strips(name, train_views(scene, split.test), folders, scores, each, device)
-        return sheet([*request.variants, "image"], rows), f"the figure shows seed {seed}"
+            rows += view_sheets(name, train_views(scene, split.test), folders, scores, each, device)
+        return png(np.concatenate(rows)), f"the figure shows seed {seed}"
     return None, "no figure: no seed succeeded in every row"
 
 
@@ -209,12 +215,8 @@ def _notes(request: StudyRequest, runs: Runs) -> list[str]:
             notes.append(f"{v}: no result for {', '.join(lost)}; its means and paired differences exclude these seeds")
     if request.seeds < 3:
         notes.append("one seed gives no intervals, two give uncertain ones; run at least three before you claim a difference")
-    last = _metrics(runs)[-1]
-    lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o[1])
-    if last == "lpips":
+    if _metrics(runs)[-1] == "lpips":
         notes.append("LPIPS was not measured, because --lpips-weights was not given")
-    elif lacking:
-        notes.append(f"{lacking} runs have no {METRICS[last][0]}; the column excludes them")
     if len(request.scenes) > 1:
         notes.append("deviations and intervals cover different seeds on these scenes, not other scenes")
     return notes
@@ -376,24 +378,22 @@ def _run_all(request: StudyRequest, places: Places, device: torch.device, lpips:
         farmed = dict(zip(fits, run_and_show(jobs, make_engine(request.device, **request.engine), request.out)))
     for key, ((_, scene, split), fit) in fits.items():
         record = farmed[key].record if farmed else None
-        if record is None:
-            say(f"[{len(runs) + 1}/{len(fits)}] {key[0]}, {key[1]}, seed {key[2]}")
-        elif record.state == "failed":
+        if record is not None and record.state == "failed":
             runs[key] = "failed", None, record.message
             continue
+        say(f"[{len(runs) + 1}/{len(fits)}] {key[0]}, {key[1]}, seed {key[2]}")
         resolved, _ = settings_by_views(fit.config, train_views(scene, split.train), device.type)
         try:
             outcome = ensure_run(fit, scene.fingerprint, split, device.type, lpips, resolved, verbose="progress")
         except WarpgsError as e:
             outcome = "failed", None, "; then ".join([*getattr(e, "__notes__", ()), str(e)])
         state, metrics, note = outcome
-        if record is None:
-            if state != "fitted":
-                say(f"  {state}{': ' if note else ''}{note}")
-            if metrics is not None:
-                say(f"  {summary_line(metrics)}")
-        elif state == "kept":
+        if record is not None and state == "kept":
             outcome = record.how, metrics, record.message
+        elif state != "fitted":
+            say(f"  {state}{': ' if note else ''}{note}")
+        if metrics is not None:
+            say(f"  {summary_line(metrics)}")
         runs[key] = outcome
         gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory is not freed
     return runs

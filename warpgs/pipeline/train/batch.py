@@ -36,20 +36,12 @@ FLOAT_BYTES = 4
 DIVIDED_BYTES = 2**26
 """Least size of a tensor whose rows are divided among processes [bytes]: the update of a smaller tensor takes less time than
 the start of two more exchanges."""
-MAX_RENDERS = 2**24
-"""Upper bound of the number of renders of a fit: the random numbers of a render depend on its index, a float32."""
 
 
 def check_ranks(batch: int, ranks: Ranks) -> None:
     """Check that every process has a view in each step of ``batch`` views."""
     if batch < ranks.count:
         raise UsageError(f"--batch {batch} is below the {ranks.count} ranks; give a multiple of them, or start fewer ranks")
-
-
-def check_renders(batch: int, steps: int) -> None:
-    """Check that the number of renders in ``steps`` of ``batch`` views is below `MAX_RENDERS`."""
-    if batch > 1 and steps * batch >= MAX_RENDERS:
-        raise UsageError(f"{steps:,} steps of {batch} views are more than {MAX_RENDERS:,} renders; lower --steps or --batch")
 
 
 def children(node: Node) -> tuple[Node, Node]:

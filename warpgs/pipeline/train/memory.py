@@ -151,22 +151,15 @@ def plan(
     }  # fmt: skip
 
 
-def plan_summary(figures: dict[str, Any]) -> str:
+def plan_summary(f: dict[str, Any]) -> str:
     """Return the result of `plan` as one line for the user."""
-    limit, available, count, _, now, cap, then, lowered_from, chunked, chunked_then, refused = figures.values()
-    text = f"memory: a step takes {format_bytes(now)} now"
-    if chunked:
-        text += ", with the image in chunks"
-    if cap > count:
-        text += f", {'about ' if limit is None else ''}{format_bytes(then)} at {cap:,} Gaussians"
-        if chunked_then and not chunked:
-            text += ", then in chunks"
-    if limit is None:
-        if then <= available:
-            return text if chunked else Detail(text)
-        reached = int(count + max(0.0, (available - now) / max(1, then - now)) * (cap - count))
-        return f"{text}; the free {format_bytes(available)} suffice for about {reached:,} Gaussians; set --memory-limit"
-    text += f"; limit {format_bytes(limit)}"
-    if lowered_from is not None:
-        text += f", so there will be at most {cap:,} Gaussians, not {lowered_from:,}"
-    return f"{text}, and steps run without a CUDA graph, which would need more" if refused else text
+    chunks = (", in chunks" * f[kind] for kind in ("chunked", "chunked_at_cap"))
+    text = f"memory: a step takes {format_bytes(f['planned'])} now{next(chunks)}"
+    text += f", about {format_bytes(f['planned_at_cap'])} at {f['cap']:,} Gaussians{next(chunks)}"
+    if f["limit"] is None:
+        if f["planned_at_cap"] <= f["available"]:
+            return Detail(text)
+        return f"{text}; only {format_bytes(f['available'])} are free: set --memory-limit, or lower --max-gaussians"
+    text += f"; limit {format_bytes(f['limit'])}"
+    text += "" if f["lowered_from"] is None else f", so there will be at most {f['cap']:,} Gaussians, not {f['lowered_from']:,}"
+    return f"{text}{', and steps run without a CUDA graph, which would need more' if f['graph_refused'] else ''}"

@@ -16,7 +16,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import is_within, read_file
 from warpgs.plugins import load_object, module_digest, module_of
 from warpgs.process import Detail
-from warpgs.schema import SchemaError, check_depth
+from warpgs.schema import check_depth
 
 if TYPE_CHECKING:
     from warpgs.pipeline.train.settings import FitConfig
@@ -154,10 +154,8 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
             raise ValueError(f"more than {MAX_DOTS} dots in a line")
         values = tomllib.loads(data.decode("utf-8"))
         check_depth(values, MAX_DEPTH)
-    except (SchemaError, RecursionError) as e:
-        raise DataError(f"{path}: nested deeper than {MAX_DEPTH} tables and lists; {remedy}") from e
-    except ValueError as e:  # no TOML, or no UTF-8
-        raise DataError(f"{path}: not valid TOML ({e}); {remedy}") from e
+    except (ValueError, RecursionError) as e:  # no TOML, no UTF-8, or too deep
+        raise DataError(f"{path}: not valid TOML of at most {MAX_DEPTH} nested tables and lists ({e}); {remedy}") from e
     return values, hashlib.sha256(data).hexdigest()[:12]
 
 

@@ -207,19 +207,16 @@ def mean_color(views: list[View]) -> Color:
 
 def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color, str]:
     """Return the colour behind a scene, and a note for the user; no note if opaque views keep the scene's own background."""
-    color = color_of(wish)
-    if color is not None:
-        return color, f"background: {wish}, {_words(color)}"
-    if wish == "mean":
-        color = mean_color(train)
-        return color, f"background: the mean colour of the training views, {_words(color)}"
-    cut_out = any(v.alpha is not None or counted_region(v)[1] == "foreground" for v in train)
-    if wish == "auto" and not cut_out:
-        color = mean_color(train)
-        return color, f"background: the mean colour of the training views, {_words(color)}; change it with --background"
-    if wish == "auto":
-        return scene.background, f"background: {_words(scene.background)}, since the views show a cut-out object"
-    return scene.background, f"background: {_words(scene.background)}, from the scene's files" if cut_out else ""
+    color, why = color_of(wish), wish
+    if color is None:
+        cut_out = any(v.alpha is not None or counted_region(v)[1] == "foreground" for v in train)
+        if wish == "mean" or (wish == "auto" and not cut_out):
+            color, why = mean_color(train), "the mean colour of the training views"
+        elif cut_out:
+            color, why = scene.background, "that of the scene's files, since views show a cut-out object"
+        else:
+            return scene.background, ""
+    return color, f"background: {why}, {_words(color)}; change it with --background"
 
 
 def over_background(scene: Scene, color: Color) -> Scene:

@@ -471,10 +471,7 @@ def _unknown(name: str, config: FitConfig, keywords: bool) -> str:
         return note
     if name in groups:
         return f"{name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
-    last = [k for k, n in known.items() if n.rpartition(".")[2] == name.rpartition(".")[2]]  # `opacity` for `init.opacity`
-    if "." in name:  # `other.every` for `mcmc.every`, but only if `other` is not similar to a group
-        own = {n for n, (path, _) in _leaves(config).items() if path[0] in ("strategy_config", *PARTS)}
-        last = [k for k in last if known[k] in own and not did_you_mean(name.partition(".")[0], groups)]
+    last = [k for k, n in known.items() if n.rpartition(".")[2] == name]  # `opacity` for `init.opacity`
     hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
     return f"unknown setting {name[:60]!r}; {hint}"
 
@@ -669,30 +666,10 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         loss=dataclasses.replace(config.loss, smooth_weight=smooth),
         stopping=dataclasses.replace(config.stopping, min_gain_db=min_gain),
     )  # fmt: skip
-    words = _words_of_choices(config, made, wanted)
+    before = dict(_values(config))
+    words = [f"{flag(n)} {value}" for n, value in _values(made) if value is not None and before[n] is None]
     named = Detail(f"settings for {views} views: {', '.join(words)}") if words else ""
     return made, [note for note in (named, limit) if note]
-
-
-def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
-    """Return a phrase for each setting of ``made`` that is None in ``config``; ``wanted`` is the unlimited number of steps."""
-    optimizer, half, last = made.optimizer, made.half_resolution, made.optimizer.average_last
-    each = f" of {config.batch} views" if config.batch > 1 else ""
-    chosen = {
-        f"at most {wanted:,} steps{each}": config.steps, f"SH degree {made.sh_degree}": config.sh_degree,
-        f"means_lr {optimizer.means_lr:g}": config.optimizer.means_lr,
-        f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
-        f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
-        f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
-        f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
-        f"mean of the last {last:.0%} of the steps" if last else "no mean of the last steps": config.optimizer.average_last,
-        f"smooth_weight {made.loss.smooth_weight:g}": config.loss.smooth_weight,
-        f"{'' if made.init.extrapolate else 'no '}extrapolated points": config.init.extrapolate,
-        "held-out blocks" if made.stopping.min_gain_db else "no held-out blocks": config.stopping.min_gain_db,
-        "two layers" if made.method.hier else "one layer": config.method.hier,
-        f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
-    }  # fmt: skip
-    return [words for words, given in chosen.items() if given is None]
 
 
 PIXELS_PER_GAUSSIAN = 4

@@ -522,9 +522,7 @@ def complexity_summary(figures: dict) -> str:
     """Return the values of `complexity_figures` as one line for the user."""
     f = figures["complexity"]
     text = f"{f['count']:,} Gaussians of mean SH degree {f['mean_degree']:.2f}, {format_bytes(f['bytes'])} uncompressed"
-    if f["marginal_db"] is not None:
-        text += f"; left-out blocks gained {f['marginal_db']:+.3f} dB between the last two measurements"
-    return f"{text}; growth stopped because {f['why']}" if f["held_out"] else f"{text}; {f['why']}"
+    return f"{text}; end of growth: {f['why']}"
 
 
 # Warmup: a tiny fit during the preparation of the real fit, to load everything that the real fit uses on a CUDA device.

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from warpgs.device import FLOAT, LOSS, PROJECTION, Needs, StepSizes
-from warpgs.errors import UsageError
+from warpgs.errors import UsageError, listed
 from warpgs.geometry import matmul, nearest_rotation, pose_at
 from warpgs.kernels.launch import first_order
 from warpgs.pipeline.metrics.scores import MATCHED_RULE, matched_psnr, render_view
@@ -286,8 +286,6 @@ ROTATION, TRANSLATION = "pose_rotation", "pose_translation"
 """Names of the parameters: w [rad] and t [u], shape [V, 3] each."""
 FOCAL, CAMERA_NUMBER = "pose_focal", "pose_camera"
 """Names of the parameters of a learned focal length: z, and the index of the view's camera, a constant; shape [V, 1] each."""
-SHOWN_LENSES = 3
-"""Largest number of cameras whose focal length is in the summary."""
 POSE_RULE = (
     "held-out cameras are moved by the similarity that best maps the given training cameras to the refined ones; held-out "
     "images are not used"
@@ -405,8 +403,7 @@ def pose_figures(given: Cameras, refined: Cameras, train: Sequence[str], held_ou
     if any(lens["given"] != lens["focal"] for lens in lenses):
         found["cameras"] = lenses
         changes = [f"{r['focal']:.1f} px, given {r['given']:.1f} ({r['focal'] / r['given'] - 1:+.1%})" for r in lenses]
-        more = f" and {len(lenses) - SHOWN_LENSES} more" if len(lenses) > SHOWN_LENSES else ""
-        summary = f"{summary}; focal length {', '.join(changes[:SHOWN_LENSES])}{more}"
+        summary = f"{summary}; focal length {listed(changes, 3)}"
     return found | {"summary": f"{summary}; {POSE_RULE}" if held_out else summary}
 
 
