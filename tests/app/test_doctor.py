@@ -53,15 +53,8 @@ def test_this_machine_can_fit():
 @pytest.mark.parametrize(
     ("name", "error", "topic", "status", "remedy", "code"),
     [
-        (
-            "safetensors",
-            ModuleNotFoundError("No module"),
-            "safetensors",
-            MISSING,
-            "pip install --force-reinstall safetensors",
-            4,
-        ),
-        ("onnxruntime", ModuleNotFoundError("No module"), "onnxruntime", NOTE, "pip install --force-reinstall onnxruntime", 0),
+        ("safetensors", ModuleNotFoundError("No module"), "safetensors", MISSING, "pip install safetensors", 4),
+        ("onnxruntime", ModuleNotFoundError("No module"), "onnxruntime", NOTE, "pip install onnxruntime", 0),
         ("cv2", ImportError("libGL.so.1"), "opencv-contrib-python-headless", MISSING, "system library", 4),
     ],
 )

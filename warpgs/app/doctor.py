@@ -78,7 +78,9 @@ def _package(distribution: str, name: str, required: bool, use: str) -> Finding:
     try:
         module = importlib.import_module(name)
     except Exception as e:
-        remedy = f"pip install --force-reinstall {distribution}, or install the system library that the message names"
+        remedy = f"pip install {distribution}"
+        if not isinstance(e, ModuleNotFoundError):
+            remedy = f"pip install --force-reinstall {distribution}, or install the system library that the message names"
         without = "a fit needs it" if required else "a fit runs without it"
         return Finding(distribution, MISSING if required else NOTE, f"{_reason(e)} ({use}; {without})", remedy)
     detail = str(getattr(module, "__version__", "of unknown version"))

@@ -354,13 +354,16 @@ def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None
     cards: list[Card] = []
     lines: list[tuple[object, ...]] = [COLUMNS]
     for status in statuses:
-        job, scene, row = status.job, status.job.request.scene.path, row_of(status)
+        r, job, scene, row = status.record, status.job, status.job.request.scene.path, row_of(status)
         files = [p if p.is_file() else None for p in (job.folder / THUMBNAIL, job.request.out / "report.html")]
         thumbnail, report = ("" if p is None else p.relative_to(folder).as_posix() for p in files)
         message = row.message.replace(f"{Path(scene).parent}{os.sep}", "")  # a page is sent
         cards.append((replace(row, message=message), thumbnail, report))
-        figures = row.psnr, row.ssim, row.gaussians, row.steps, row.ply_bytes, round(row.seconds, 3)
-        lines.append((row.name, scene, row.state, row.how, *figures, row.files.get(PLY, ""), row.message))
+        if r is None:
+            lines.append((job.name, scene, status.state, *[""] * (len(COLUMNS) - 3)))
+        else:  # csv writes None as an empty field
+            figures = r.psnr, r.ssim, r.gaussians, r.steps, r.ply_bytes, round(r.seconds, 3)
+            lines.append((r.name, scene, r.state, r.how, *figures, r.files.get(PLY, ""), r.message))
     write_text(folder / INDEX, farm_page(folder.resolve().name, cards, seconds))
     write_csv(folder / TABLE, lines)
 

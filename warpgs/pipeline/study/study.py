@@ -26,7 +26,7 @@ from warpgs.pipeline.run.folder import open_run, versions
 from warpgs.pipeline.run.request import FitRequest, SceneRequest, choose_device, read_scene
 from warpgs.pipeline.run.results import LABELS, summary_line
 from warpgs.pipeline.study import tables
-from warpgs.pipeline.study.tables import GAUSSIANS, Sample, Table, paired_difference, sample
+from warpgs.pipeline.study.tables import GAUSSIANS, METRICS, Sample, Table, paired_difference, sample
 from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.trainer import train_views
@@ -215,8 +215,12 @@ def _notes(request: StudyRequest, runs: Runs) -> list[str]:
             notes.append(f"{v}: no result for {', '.join(lost)}; its means and paired differences exclude these seeds")
     if request.seeds < 3:
         notes.append("one seed gives no intervals, two give uncertain ones; run at least three before you claim a difference")
-    if _metrics(runs)[-1] == "lpips":
+    last = _metrics(runs)[-1]
+    lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o[1])
+    if last == "lpips":
         notes.append("LPIPS was not measured, because --lpips-weights was not given")
+    elif lacking:
+        notes.append(f"{lacking} runs have no {METRICS[last][0]}; the column excludes them")
     if len(request.scenes) > 1:
         notes.append("deviations and intervals cover different seeds on these scenes, not other scenes")
     return notes
