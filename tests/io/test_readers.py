@@ -88,7 +88,7 @@ def test_what_a_reader_returns_is_checked(folder):
     spoil = lambda scene: replace(scene, views=(replace(scene.views[0], **changes), *scene.views[1:]))  # noqa: E731
     refused(folder, r"'9.png': image must be float32, in \[0, 1\], shape \[12, 16, 3\]; got shape", reader=Cameras(spoil))
     few = Cameras(lambda scene: replace(scene, views=scene.views[:1]))
-    refused(folder, r"1 usable view \(made in memory\)", reader=few)
+    refused(folder, r"1 usable views \(made in memory\)", reader=few)
     with pytest.raises(UsageError, match=r"Cameras\.read must return a Scene; it returned NoneType"):
         load_scene(folder, reader=Cameras(lambda s: None))
     with pytest.raises(UsageError, match="reader memory must return a Scene in file coordinates"):

@@ -71,8 +71,7 @@ class _BinaryFile:
         (count,) = self.take("Q")
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
-            fix = "truncated or foreign. Copy it again"
-            raise DataError(f"{self.path}: announces {count:,} records and holds at most {capacity:,}: {fix}")
+            raise DataError(f"{self.path}: truncated: {count:,} records announced, at most {capacity:,} found. Copy it again")
         for _ in range(count):
             yield self
         if self.at != len(self.data):
@@ -161,8 +160,7 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
         """Refuse a model; FULL_OPENCV without rational terms is OPENCV with k3, which can be undistorted."""
         if model not in known and not (model == "FULL_OPENCV" and not any(parameters[9:])):
             kept = ", or fit with --lenses native" if model in counts else ""
-            fix = f"Run `colmap image_undistorter` and give its output folder{kept}"
-            raise DataError(f"{path}: camera model {model} is not supported (supported: {', '.join(known)}). {fix}")
+            raise DataError(f"{path}: camera model {model} is not supported. Run `colmap image_undistorter`{kept}")
 
     if path.suffix == ".bin":
         for r in _BinaryFile(path).records(24):

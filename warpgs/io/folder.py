@@ -142,9 +142,8 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     first = 1 if min(ids) == 1 and not named_by_dtu(names) else 0  # files renamed 001, 002, ... count from one
     by_id = {i - first: name for i, name in zip(ids, names)}
     if missing := [i for i in range(max(least, len(names))) if i not in by_id]:
-        counted = f"(ids are counted from 0, names run from {names[0]} to {names[-1]})"
-        fix = "restore them, because the protocol's ids would otherwise select other views"
-        raise DataError(f"{where}: images with the ids {listed(missing, 8)} are missing {counted}; {fix}")
+        counted = f"counted from 0, names run from {names[0]} to {names[-1]}"
+        raise DataError(f"{where}: images with the ids {listed(missing, 8)} are missing ({counted}); restore them")
     return {i: by_id[i] for i in wanted}
 
 
@@ -372,9 +371,8 @@ class SceneFolder:
             of_unmasked, of_known = ({f for n in names for f in masks.get(n, [])} for names in (unmasked, known))
             if lone := [f for f in files if f in of_unmasked or f not in of_known]:
                 image = min(unmasked.values())
-                lost = f"{len(lone)} of {len(files)} files in {folder.name} match no image or several"
-                fix = f"name a mask like its image: {image.with_suffix('.png')} or {image}.png"
-                notes.append(f"{lost}, such as {lone[0].relative_to(folder)}; {fix}")
+                lost = f"{len(lone)} of {len(files)} files in {folder.name}, such as {lone[0].relative_to(folder)},"
+                notes.append(f"{lost} match no image or several; name a mask like its image: {image.with_suffix('.png')}")
         return notes
 
     def images(self, base: str = "images") -> tuple[Path, int, str]:
@@ -551,8 +549,8 @@ class ViewList:
         notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
         if self._narrow:
             name, left = min(self._narrow.items(), key=lambda item: item[1])
-            fix = "check the distortion, or use --lenses native"
-            notes.append(f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}; {fix}")
+            many = f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}"
+            notes.append(f"{many}; check it, or use --lenses native")
         cutout = options is not None and options.masks == "cutout"
         if options is None or not self._kept:
             return [*notes, "--masks cutout changes nothing: no image has a mask file"] if cutout else notes

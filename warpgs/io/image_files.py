@@ -96,8 +96,7 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None 
             return read_start(path, start)
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
     except OSError as e:
-        fix = "restore it, or remove its camera from the scene"
-        raise DataError(f"{path}: the image cannot be read ({unread_reason(e)}); {fix}") from e
+        raise DataError(f"{path}: the image cannot be read ({unread_reason(e)}); restore it, or remove its camera") from e
 
 
 # Size and damage. Functions take the bytes of a file, and raise a ValueError with the reason as part of a sentence.
@@ -429,8 +428,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         width, height = header_size(name, data)
         if (pixels := width * height) > max_pixels:
             size = f"the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels"
-            needs = f"--max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
-            raise DataError(f"{path}: {size}; shrink it, or raise the limit with {needs}")
+            raise DataError(f"{path}: {size}; shrink it, or raise the limit with --max-pixels {pixels}")
         expect(pixels, f"it has {width} x {height} px")
         if (raster := _decoded(name, data)) is None:
             # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
@@ -438,11 +436,10 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         expect(raster is not None and raster.shape[:2] == (height, width), "its pixels cannot be read")
     except (cv2.error, MemoryError, ValueError) as e:
         if isinstance(e, MemoryError) or getattr(e, "code", None) == cv2.Error.StsNoMem:
-            needs = f"needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB of free memory"
-            raise ResourceError(f"{path}: decoding the image {needs}; shrink the image, or end other programs") from e
+            needs = f"{BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB"
+            raise ResourceError(f"{path}: decoding the image needs {needs}; shrink it, or end other programs") from e
         reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else e
-        fix = "Restore it from its source; if it looks right, save it as PNG"
-        raise DataError(f"{path}: the image cannot be decoded: {reason}. {fix}") from e
+        raise DataError(f"{path}: the image cannot be decoded: {reason}. Restore it, or save it as PNG") from e
     return raster
 
 

@@ -14,8 +14,6 @@ from warpgs.io.images import LoadedImage, ReadOptions, turn_upright, undistortio
 from warpgs.scene import GivenDepth, View
 
 SUFFIXES = (".png", ".npy")
-UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
-"""Suffixes of unsupported files that may hold maps, for a message."""
 NONE = "none"
 """Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
@@ -37,17 +35,14 @@ def map_files(folder: Path, flag: str, allow_outside: bool) -> dict[str, Path]:
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
     files: dict[str, Path] = {}
-    paths = [p for p in sorted(folder.rglob("*")) if p.name[0] != "."]
-    for file in paths:
+    for file in sorted(folder.rglob("[!.]*")):
         if file.suffix.lower() in SUFFIXES and file.is_file():
             key = file.relative_to(folder).with_suffix("").as_posix()
             if key in files:
                 raise DataError(f"{file}: {files[key].name} is for the same image; remove one of them")
             files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
     if all(key.endswith(CONFIDENCE) for key in files):
-        others = sorted({p.suffix.lower() for p in paths} & set(UNREAD))
-        found = f"it holds {' and '.join(others)} files, which are not read; convert them to" if others else "add"
-        raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
+        raise DataError(f"{folder}: holds no maps; add NPY (float32) or 16-bit PNG, named like the images")
     return files
 
 
@@ -108,8 +103,7 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     if found.ndim not in (2, 3) or 0 in found.shape or (found.ndim == 3 and found.shape[2] > 4):
         raise DataError(f"{path}: must be an array [height, width] or [height, width, 3], not {list(found.shape)}")
     if found.shape[0] * found.shape[1] > max_pixels:
-        fix = "shrink it, or raise --max-pixels"
-        raise DataError(f"{path}: {found.shape[1]} x {found.shape[0]} px are over {max_pixels:,}; {fix}")
+        raise DataError(f"{path}: has more than {max_pixels:,} pixels; shrink it, or raise --max-pixels")
     native = found.dtype.newbyteorder("=")
     return array_numbers(path, found, native if native in (np.uint8, np.uint16) else np.float32, "save the map alone")
 
@@ -153,8 +147,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     """
     raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
     if raw.shape != shape:
-        fix = "make both equal in size"
-        raise DataError(f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; {fix}")
+        raise DataError(f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; resize one")
     values = raw.astype(np.float32)
     if raw.dtype.kind == "u":
         values /= 2 if 0 < int(raw.max()) <= 2 else np.iinfo(raw.dtype).max
@@ -181,9 +174,8 @@ def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
         raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
-        median = float(np.median(lengths[known]))
         fix = "save PNG as (n + 1) / 2, or NPY with unit vectors"
-        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals (median length {median:.3g}); {fix}")
+        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals; {fix}")
     known &= np.abs(lengths - 1) <= UNIT_TOLERANCE
     normals = np.where(known[..., None], values / np.where(known, lengths, 1)[..., None], 0).astype(np.float32)
     if options.normal_axes == "opengl":
@@ -235,8 +227,7 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
             raise DataError(f"{path}: EXIF rotates its image, and normals are not rotated with it; save both upright")
         values = turn_upright(values, loaded.orientation)
     elif not _same_aspect(values.shape, (height, width)):
-        fix = "Give a map of the whole image"
-        raise DataError(f"{path}: is {columns} x {rows} px, its image {width} x {height}: the aspects differ. {fix}")
+        raise DataError(f"{path}: is {columns} x {rows} px, its image {width} x {height}; give a map of the whole image")
     final = loaded.image.shape[:2]
     if loaded.undone is not None:
         values = resized(values, width, height)
@@ -323,10 +314,8 @@ class GivenMaps:
         if not known.any():
             raise DataError(f"{path}: no pixel inside the mask has a normal; remove the file: normals are optional")
         if away > 0.5:
-            axes = self.options.normal_axes
-            other = "opencv" if axes == "opengl" else "opengl"
-            fix = f"give --normal-axes {other}, or turn them towards the camera"
-            raise DataError(f"{path}: {away:.0%} of its normals face away from the camera in {axes} axes; {fix}")
+            other = "opencv" if self.options.normal_axes == "opengl" else "opengl"
+            raise DataError(f"{path}: {away:.0%} of its normals face away from the camera; give --normal-axes {other}")
         return np.where((along <= 0)[..., None], normals, 0).astype(np.float32)
 
 
@@ -337,8 +326,7 @@ def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
         having = [v for v in views if getattr(v, name) is not None]
         if path not in (None, NONE) and not having:
             names = [key for key in map_files(Path(path), flag, True) if not key.endswith(CONFIDENCE)]
-            count = f"none of its {len(names)} maps has the name of an image (the first is {names[0]!r})"
-            raise DataError(f"{path}: {count}; name each map like its image, with .png or .npy, or give another {flag}")
+            raise DataError(f"{path}: none of its {len(names)} maps, as {names[0]!r}, has the name of an image; rename them")
         if not having:
             continue
         where = f"from {Path(path)}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"

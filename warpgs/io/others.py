@@ -223,8 +223,7 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
                 raise DataError(f"{path}, line {number}, image {words[0]!r}: needs 21 finite numbers. Copy it again")
             rows.append((number, words[0], values))
     except (OSError, ValueError) as e:
-        fix = "needs a count, then names with 21 numbers. Copy it again"
-        raise DataError(f"{path}: cannot be understood ({unread_reason(e)}); {fix}") from e
+        raise DataError(f"{path}: cannot be understood ({unread_reason(e)}); copy it again") from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")
     return rows
@@ -253,8 +252,7 @@ class MiddleburyReader(Reader):
             where = f"{path}, line {number}, image {name!r}"
             K = _centred(values[:9].reshape(3, 3).copy(), where)
             if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
-                lower = "its lower rows are not 0 fy cy, 0 0 1"
-                raise DataError(f"{where}: K is not a matrix of intrinsics ({lower}); calibrate again")
+                raise DataError(f"{where}: K is not a matrix of intrinsics, fx 0 cx, 0 fy cy, 0 0 1; calibrate again")
             viewmat = scenes.rigid(pose_of(values[9:18].reshape(3, 3), values[18:21]), where)
             file, view = scene.child(folder, name, where), views.claim(scenes.view_name(name), where)
             mask = scene.mask_of(file, folder, folder / "masks")

@@ -81,8 +81,8 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
     if model not in known:
-        fix = f"Undistort the images first{kept if model == FISHEYE else ''}"
-        raise DataError(f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(known)}). {fix}")
+        kept = kept if model == FISHEYE else ""
+        raise DataError(f"{where}: camera model {model[:40]} is not supported. Undistort the images{kept}")
     fisheye = native and bool(model == FISHEYE or frame.get("is_fisheye", shared.get("is_fisheye")))
     number = partial(_number, frame, shared, where=where)
     width, height = (own if (given := number(key)) is None else int(given) for key, own in (("w", width), ("h", height)))
@@ -99,8 +99,8 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
     unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
     other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
     if other:
-        why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
-        raise DataError(f"{where}: {other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
+        kept = kept if other[0] == "is_fisheye" else ""
+        raise DataError(f"{where}: {other[0]} is not supported for this lens. Undistort the images{kept}")
     fx = f[0] if f[0] is not None else f[1]
     if fx is None:
         raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown; add one of them")
@@ -382,8 +382,7 @@ def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
             if not 0 < fov < 180:
                 raise ValueError("fov")
         except (KeyError, TypeError, ValueError, OverflowError) as e:
-            needs = "camera_to_world (16 numbers), fov, and render_width and render_height of the file"
-            raise DataError(f"{where}: needs {needs}; export the path again") from e
+            raise DataError(f"{where}: needs camera_to_world, fov, render_width and render_height; export it again") from e
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov))
         lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
         yield f"{i:05d}", scenes.from_camera_to_world(pose, where, opengl=True), lens.checked(where)
