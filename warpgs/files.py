@@ -279,8 +279,7 @@ def _sync(folder: Folder) -> None:
             os.fsync(folder.descriptor)
     except OSError as e:
         if e.errno not in NO_FOLDER_SYNC:
-            why = f"the disk does not confirm it ({e.strerror or e})"
-            raise ResourceError(f"{folder.path}: was written, but {why}; check the disk and the last written files") from e
+            raise ResourceError(f"{folder.path}: the disk does not confirm a write ({e.strerror or e}); check the disk") from e
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:

@@ -84,8 +84,7 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
         with contextlib.suppress(FileNotFoundError):
             found = self.lstat(name)
             if stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == JUNCTION:
-                why = "is a link, and links inside of a results folder are not followed"
-                raise RefusedError(f"{self.path / name}: {why}; put its target there. The results folder itself may be a link")
+                raise RefusedError(f"{self.path / name}: is a link inside of a results folder; put its target there")
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
         """Open a file, and return its descriptor."""

@@ -138,8 +138,7 @@ def _locked(folder: Folder, name: str, flags: int) -> tuple[int, bool | None]:
         if locked is False:
             os.lseek(descriptor, 1, os.SEEK_SET)
             holder = os.read(descriptor, MOST_BYTES).decode("utf-8", "replace") or "another process"
-            fix = "Wait until that process ends, end it, or choose another folder"
-            raise FolderHeldError(f"{folder.path}: {holder} is writing there. {fix}")
+            raise FolderHeldError(f"{folder.path}: {holder} is writing there. Wait for its end, or choose another folder")
         return descriptor, locked
     except BaseException:
         os.close(descriptor)
@@ -167,9 +166,8 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
             base.mkdir(mode=0o700, parents=True, exist_ok=True)
             base = base.resolve()
             if (others := open_to_others(base)) is not None:
-                risk = f"other users can write to {others} and could run code as you"
-                fix = "name a private folder that all nodes see with --slurm-folder"
-                raise UsageError(f"{base}: not safe for Slurm's job files: {risk}; {fix}")
+                risk = f"not safe for Slurm's job files, as other users can write to {others}"
+                raise UsageError(f"{base}: {risk}; name a private, shared --slurm-folder")
             above = stack.enter_context(open_folder(base))
             sweep(above)
             made = stack.enter_context(Temporary(above))

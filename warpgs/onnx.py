@@ -118,8 +118,7 @@ def check_onnx(data: bytes, path: Path) -> None:
             expect(count <= MAX_NODES, f"more than {MAX_NODES:,} nodes once its functions are inlined")
             if kind == "tensor" and any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in part):
                 weights = f"the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not read"
-                fix = "`onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
-                raise DataError(f"{path}: {weights}. Save the model as one file: {fix}")
+                raise DataError(f"{path}: {weights}. Save it as one file: `onnx.save(onnx.load(FILE), OUT)`")
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
                     raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
@@ -185,8 +184,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Any:
     there = [name for name, long in PROVIDERS.items() if long in ort.get_available_providers()]
     remedy = "`pip uninstall onnxruntime`, then `pip install onnxruntime-gpu[cuda,cudnn]`; or leave the flag out"
     if provider not in there:
-        has = f"this onnxruntime {ort.__version__} has only {', '.join(there)}"
-        raise ResourceError(f"--onnx-provider {provider}: {has}. {remedy}")
+        raise ResourceError(f"--onnx-provider {provider}: this onnxruntime has only {', '.join(there)}. {remedy}")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads or usable_cores()
     options.inter_op_num_threads = 1
@@ -246,6 +244,5 @@ class Model:
             answer = _interruptible(lambda: self.session.run(names, feed, options), lambda: setattr(options, "terminate", True))
             return [np.asarray(output) for output in answer]
         except Exception as e:  # onnxruntime's errors share no base but Exception
-            shape = " x ".join(map(str, images[0].shape))
-            fix = f"describe it in {self.path.name}.json"
-            raise DataError(f"{self.path}: onnxruntime refuses an input of {shape} ({_first_line(e)}); {fix}") from e
+            refused = f"onnxruntime refuses an input of {' x '.join(map(str, images[0].shape))} ({_first_line(e)})"
+            raise DataError(f"{self.path}: {refused}; describe it in {self.path.name}.json") from e

@@ -94,9 +94,8 @@ class Registry(Generic[T]):
         if name in self._classes or name in self.names():
             return self._classes[name]
         if isinstance(name, str) and ":" in name:
-            why = "a class of your own. The file of a preset or run does not load your code"
-            fix = "name the class on the command line or in a preset that is a .py file, or pass it in Python"
-            raise UsageError(f"the {self.kind} {name!r} is {why}: {fix}")
+            fix = "name it on the command line or in a preset that is a .py file, or pass it in Python"
+            raise UsageError(f"the {self.kind} {name!r} is a class of your own. A file does not load your code: {fix}")
         more = "import the file that registers it first, in Python" if self.kind == "camera model" else "give module:Class"
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or {more}")
 

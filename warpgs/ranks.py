@@ -223,9 +223,8 @@ class RankWatch:
         until = time.monotonic() + seconds
         while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
             if time.monotonic() > until:
-                there = f"only {self.count - len(missing)} of {self.count} ranks connected within {seconds:.0f} s"
-                fix = "Start all ranks with the same MASTER_ADDR and MASTER_PORT"
-                raise ResourceError(f"{there}; rank {missing[0]} is missing. {fix}")
+                there = f"rank {missing[0]} of {self.count} did not connect within {seconds:.0f} s"
+                raise ResourceError(f"{there}. Start all ranks with the same MASTER_ADDR and MASTER_PORT")
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
@@ -412,8 +411,7 @@ class Group(Ranks):
 def _number(name: str, least: int, most: int, default: str | None = None) -> int:
     text = os.environ.get(name, default)
     if text is None or not text.isdecimal() or not least <= int(text) <= most:
-        fix = "start the fit with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
-        raise UsageError(f"the environment variable {name} must be a whole number from {least} to {most}, not {text!r}; {fix}")
+        raise UsageError(f"the variable {name} must be a whole number from {least} to {most}, not {text!r}; use torchrun")
     return int(text)
 
 
@@ -456,9 +454,8 @@ def join(device: str) -> Ranks:
     _joined = Group(rank, count, backend, watch)
     if cuda:
         if torch.cuda.device_count() <= local:
-            found = f"torch finds {torch.cuda.device_count()} GPUs, and NCCL needs one for each process"
-            fix = "Start fewer processes, or give --device cpu"
-            raise ResourceError(f"rank {rank} needs GPU {local} of this machine, but {found}. {fix}")
+            there = f"rank {rank} needs GPU {local} of this machine, and torch finds {torch.cuda.device_count()}"
+            raise ResourceError(f"{there}. Start fewer processes, or give --device cpu")
         torch.cuda.set_device(local)
     watch.meet(JOIN_SECONDS)
     try:

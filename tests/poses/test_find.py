@@ -414,7 +414,7 @@ def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, 
     view = found_mapping().views[0]
     found = found_mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
     notes = record_of(found, unposed(range(count), focal), "0", [])["notes"]
-    assert any(f"An estimate from {count} photographs is often 5 % off" in n for n in notes) is said
+    assert any(f"an estimate from {count} photographs is often 5 % off" in n for n in notes) is said
     assert not any("times their longer side" in n for n in notes)
     stretched = {"focal": 900, "distortion": 0, "width": 320, "height": 240}
     notes = record_of(found_mapping(cameras=(stretched,)), unposed(range(5), focal), "0", [])["notes"]
@@ -429,7 +429,7 @@ def test_records_reasons_and_advice():
     assert "matches no other" in reason(found_mapping(matches={}), 3, names)
     said = advice(found, names)
     for line, words in zip(
-        said, ("between d and c", "take e again", "b and c, whose axes differ by 50", "only 40 matches"), strict=True
+        said, ("between d and c", "take e again", "b and c, 50 degrees apart", "only 40 matches"), strict=True
     ):
         assert words in line
     joined = found_mapping(matches={(0, 1): 200, (1, 2): 90, (2, 3): 9, (3, 4): 300}, keypoints=(900, 800, 700, 600, 500))

@@ -351,7 +351,7 @@ def test_sizes_of_free_inputs_and_resizing():
 
 def test_outputs_that_are_no_depth_are_refused(tmp_path):
     network = Network(nw.depth_network(tmp_path / "d.onnx"))
-    with pytest.raises(DataError, match=r"smallest depth is .*JSON file beside it"):
+    with pytest.raises(DataError, match=r"smallest depth is .*JSON file"):
         network_disparity(network, Preprocessing(32, 32, (6.0,) * 3, (0.2,) * 3, "depth"), photo(32, 32))
     network = Network(nw.segmentation_network(tmp_path / "s.onnx"))
     with pytest.raises(DataError, match=r"shape \(1, 21, 384, 384\), not that of one depth map"):

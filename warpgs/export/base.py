@@ -116,12 +116,11 @@ def arrays_to_write(
         arrays = arrays_of(g)
         for name, array in arrays.items():
             if bad := array.size - int(np.isfinite(array).sum()):
-                fix = "export an earlier checkpoint, or fit again with a lower learning rate"
-                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; {fix}")
+                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; export an earlier checkpoint")
     logits = arrays["logit_opacities"]
     if logits.size and 0 <= logits.min() < logits.max() <= 1:
         words = "all logit_opacities are in [0, 1], as opacities are; ActivatedGaussians(...).stored() makes logits"
-        warnings.warn(f"{path}: {words} and log scales", stacklevel=2)
+        warnings.warn(f"{path}: {words}", stacklevel=2)
     if origin.any():
         arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
     return arrays, origin
@@ -374,8 +373,7 @@ class Format:
             arrays["sh"] = arrays["sh"][:, :1]
         elif gaussians.sh_degree > self.max_degree:
             most = f"{self.suffix} files hold harmonics up to degree {self.max_degree}, not {gaussians.sh_degree}"
-            fix = f"--sh-degree {self.max_degree}, in Python with sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
-            raise DataError(f"{path}: not written, {most}. Drop higher degrees with {fix}")
+            raise DataError(f"{path}: not written, {most}. Give --sh-degree {self.max_degree}, or write .ply")
         pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
         self.store(path, [returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces])
         if type(self).origin_in is Format.origin_in:
@@ -507,8 +505,7 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
         raise UsageError(f"{path}: is the folder of a SOG model; give {Path(path) / 'meta.json'}")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
     one = f"use one of {', '.join(k.suffix for k in known)}, or give a format of your own{cameras}"
-    others = "`warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
-    raise UsageError(f"{path}: format {Path(path).suffix or '(none)'} is not supported; {one}. {others}")
+    raise UsageError(f"{path}: format {Path(path).suffix or '(none)'} is not supported; {one}")
 
 
 def write_gaussians(

@@ -406,8 +406,7 @@ def _plain(path: Path, file: BinaryIO, notes: list[str]) -> base.Arrays:
     logits, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and logits.min() >= 0 and logits.max() <= 1 and scales.min() > 0:
         values = f"all opacities are from {logits.min():.2g} to {logits.max():.2g} and all log scales above 0"
-        why = "as if stored after the sigmoid and the exponential; they are read as logits and logarithms"
-        notes.append(f"{path}: {values}, {why}. If images are foggy, export the model again without activations")
+        notes.append(f"{path}: {values}. If images are foggy, export the model again without activations")
     return arrays
 
 

@@ -471,10 +471,7 @@ def kept(ctx: Any) -> tuple[Any, ...]:
         now = tensor.shape, tensor.dtype, tensor.device
         if now != (shape, dtype, device) or (address is not None and tensor.data_ptr() != address):
             before, after = (f"{list(s)} {t} on {d}" for s, t, d in ((shape, dtype, device), now))
-            raise RuntimeError(
-                f"the .data of a tensor was replaced between the forward and the backward pass ({before}, now {after}): "
-                "replace it after the backward pass, or render again"
-            )
+            raise RuntimeError(f"a .data was replaced between forward and backward pass ({before}, now {after}): render again")
     return tuple(tensors)
 
 
@@ -505,10 +502,8 @@ def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> t
 def refuse_transforms() -> None:
     """Raise UsageError within a transform of torch.func."""
     if torch._C._are_functorch_transforms_active():
-        raise UsageError(
-            "rasterize does not support torch.func (grad, vmap, jacrev, jvp): use torch.autograd.grad or backward() for "
-            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] instead of vmap"
-        )
+        fix = "use torch.autograd.grad, torch.autograd.functional.jacobian, and a batch of cameras instead of vmap"
+        raise UsageError(f"rasterize does not support torch.func (grad, vmap, jacrev, jvp): {fix}")
 
 
 @functools.lru_cache(maxsize=64)

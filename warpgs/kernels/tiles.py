@@ -510,11 +510,9 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     if countable and needed <= budget:
         return
     limit = format_bytes(budget) if countable else f"{MAX_INSTANCES:,} instances"
-    raise ResourceError(
-        f"{visible:,} visible Gaussians touch {total / max(visible, 1):.0f} of {tiles} tiles on average; their {total:,} "
-        f"(Gaussian, tile) instances need {format_bytes(needed)}, and the limit is {limit}. Many Gaussians are probably far "
-        "too large: check their scales, or render smaller images, fewer cameras at once, or raise the memory budget."
-    )
+    touched = f"{visible:,} visible Gaussians touch {total / max(visible, 1):.0f} of {tiles} tiles on average"
+    needs = f"their {total:,} (Gaussian, tile) instances need {format_bytes(needed)}, and the limit is {limit}"
+    raise ResourceError(f"{touched}; {needs}. Check their scales, render smaller images, or raise the memory budget")
 
 
 def _depth_order(projected: Tensor, counts: Tensor, tiles: int, memory: InstanceMemory) -> tuple[Tensor, int, int]:

@@ -84,8 +84,7 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
             said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
     for i, j, angle in sorted(neighbours(found), key=lambda t: -t[2]):
         if angle > WIDE_ANGLE and dict(found.links[i]).get(j, 0) < WEAK_MATCHES:
-            pair = f"{names[i]} and {names[j]}"
-            said.append(f"take one or two photographs between {pair}, whose axes differ by {angle:.0f} degrees")
+            said.append(f"take one or two photographs between {names[i]} and {names[j]}, {angle:.0f} degrees apart")
     for i in found.views:
         j, n = next((link for link in found.links[i] if link[0] in found.views), (i, WEAK_MATCHES))
         if n < WEAK_MATCHES:
@@ -139,6 +138,7 @@ def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: 
         })  # fmt: skip
     focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
     count = f"{len(found.views)} photographs"
+    estimate = f"an estimate from {count} is often 5 % off, at worst 20 % or more"
     remarks = [
         f"poses found for {len(found.views)} of {len(names)} photographs from {found.points:,} points, mean reprojection error "
         f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
@@ -146,15 +146,9 @@ def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: 
     if found.kept_focal:
         remarks.append(f"the focal length is taken from EXIF, because {count} cannot improve it")
     elif found.kept_focal is False:
-        remarks.append(
-            f"the EXIF focal length does not fit the {count}, which may be cropped; the focal length was estimated instead. "
-            "Such an estimate is often 5 % off, at worst 20 % or more"
-        )
+        remarks.append(f"the EXIF focal length does not fit the {count}, which may be cropped; {estimate}")
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
-        remarks.append(
-            f"EXIF holds no focal length. An estimate from {count} is often 5 % off, at worst 20 % or more, and so is depth. "
-            "Add photographs from more directions"
-        )
+        remarks.append(f"EXIF holds no focal length; {estimate}, and so is depth. Add photographs from more directions")
     for c in found.cameras:
         width, height, times = c["width"], c["height"], c["focal"] / max(c["width"], c["height"])
         if not USUAL[0] < times < USUAL[1]:
@@ -303,8 +297,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
     try:
         if not photos.is_video(source):
             if not source.is_dir():
-                there = files.NOT_REGULAR if source.exists() else "does not exist"
-                what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
+                what = "is not a folder, or a video (mp4, mov, m4v, avi, mkv, webm)" if source.exists() else "does not exist"
                 raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
             if other := _something_else(source):
                 raise UsageError(f"{source}: {other}")
@@ -377,9 +370,8 @@ def _check_found(source: Path, found: Mapping, photographs: list[photos.Photogra
     count, blank = len(photographs), sum(k < MIN_KEYPOINTS for k in found.keypoints)
     if 2 * blank >= count:
         why = (
-            f"{blank} of {count} photographs show almost nothing that can be matched (fewer than {MIN_KEYPOINTS} keypoints; "
-            f"the best one has {max(found.keypoints):,}): a blank wall, darkness or blur. Take sharp photographs of textured "
-            "things, in good light"
+            f"{blank} of {count} photographs have fewer than {MIN_KEYPOINTS} keypoints (the best {max(found.keypoints):,}): a "
+            "blank wall, darkness or blur. Take sharp photographs of textured things, in good light"
         )
     elif not max(found.matches.values(), default=0):
         why = f"no two of {count} photographs could be matched. Take photographs that overlap by two thirds, in small steps"

@@ -236,8 +236,7 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
     try:
         return _OneOutput(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
     except (OSError, ValueError) as e:
-        why = f"the weights cannot be loaded ({str(e).splitlines()[0][:200]})"
-        raise DataError(f"{name}: {why}; connect to the internet to download them, or name their folder with --weights") from e
+        raise DataError(f"{name}: not loaded ({str(e).splitlines()[0][:200]}); give a folder of weights with --weights") from e
 
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
@@ -276,7 +275,7 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
 def _own_weights(path: str | None) -> dict[str, Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if path is None:
-        fix = "give your own with --weights FILE.safetensors, or export fcn-resnet50, for which torchvision has weights"
+        fix = "give your own with --weights FILE.safetensors, or export fcn-resnet50"
         raise UsageError(f"fcn-resnet18: no public weights for the 21 VOC classes are known; {fix}")
     from safetensors import SafetensorError
     from safetensors.torch import load

@@ -82,8 +82,7 @@ class Network(Model):
             raise DataError(f"{path}: its input is a {kind}; float or float16 is needed")
         dims, text = [d if isinstance(d, int) and d > 0 else None for d in shape], " x ".join(map(str, shape))
         if len(dims) != 4 or dims[0] not in (1, None):
-            needed = "one image, 1 x 3 x height x width or 1 x height x width x 3, is needed"
-            raise DataError(f"{path}: its input is {text}; {needed}")
+            raise DataError(f"{path}: its input is {text}, not one image, 1 x 3 x height x width or 1 x height x width x 3")
         self.layout = "nchw" if dims[1] == 3 or (dims[1] is None and dims[3] != 3) else "nhwc"
         if self.layout == "nhwc" and dims[3] != 3:
             raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of images")
@@ -291,10 +290,8 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
         raise DataError(f"{network.path}: its output has the shape {shape}, not that of one depth map; is it a depth network?")
     if preprocessing.output == "depth":
         if not output.min() > 0:
-            raise DataError(
-                f"{network.path}: its smallest depth is {output.min():.3g}, but depths must be above 0; "
-                'if the network gives inverse depth, write {"output": "disparity"} into the JSON file beside it'
-            )
+            why = f"its smallest depth is {output.min():.3g}, not above 0"
+            raise DataError(f'{network.path}: {why}; for inverse depth, write {{"output": "disparity"}} into its JSON file')
         output = 1 / output
     return unit_range(resize(output, *image.shape[:2]))
 

@@ -185,8 +185,7 @@ def _by_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: 
         notes.append("depth: neither a network nor other views gave depth, so the importance has no geometry score")
         return lambda i: ((np.zeros(views[i].image.shape[:2], np.float32),), "none")
     fractions = [float(d.valid.mean()) for d in depths]
-    span = f"{min(fractions):.1%} to {max(fractions):.1%}"
-    notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
+    notes.append(Detail(f"depth: from the other views, at {min(fractions):.1%} to {max(fractions):.1%} of the pixels"))
     if poor := [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]:
         notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
 
@@ -242,8 +241,7 @@ def view_priors(
     # both are opened before either runs: a wrong file is found at once
     opened = None if config.depth_model is None else _by_network("depth", views, config, threads, cache, notes)
     if classical:
-        words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
-        notes.append(Detail(f"{words}; --segmentation-model adds a network"))
+        notes.append(Detail("semantics: saliency as foreground, edges as boundaries; --segmentation-model adds a network"))
         found = [(maps, "saliency and edges") for maps in classical_maps([v.image for v in views], tell)]
     else:
         semantics = _by_network("segmentation", views, config, threads, cache, notes)
@@ -256,6 +254,5 @@ def view_priors(
         priors.append(Prior(d, confidence, boundary, foreground, where, source))
     notes += cache.notes
     if cache.found:
-        words = f"priors: {cache.found} of {cache.found + cache.made} maps were read from the cache {cache.folder}"
-        notes.append(Detail(words))
+        notes.append(Detail(f"priors: {cache.found} of {cache.found + cache.made} maps read from the cache {cache.folder}"))
     return priors, notes

@@ -99,10 +99,8 @@ def _check_pose(matrix: list[list[float]], where: str) -> None:
     )  # fmt: skip
     off = max(map(abs, products))
     if not off <= POSE_TOLERANCE:  # products of huge numbers overflow
-        raise ValueError(
-            f"{where} scales or shears: R R^T is off by {off:.2g} from the identity, where R is the upper left 3 x 3 block. "
-            "Give a rotation. If the pose is scaled, divide its first three rows by the scale; this also divides depths"
-        )
+        fix = "give a rotation; divide the first three rows by any scale, which also divides depths"
+        raise ValueError(f"{where} scales or shears: R R^T is off by {off:.2g} from the identity; {fix}")
 
 
 INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
@@ -224,8 +222,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     x, y, w, h = options.window
     inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
     if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
-        fix = f"its edges must be multiples of {side} px, or edges of the {width} x {height} px image"
-        raise UsageError(f"window {options.window}: {fix}")
+        raise UsageError(f"window {options.window}: edges must be multiples of {side} px, or edges of the image")
     return x, y, w, h
 
 
@@ -250,10 +247,8 @@ def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: Tens
     needed = len(layers[0][1]) * window[2] * window[3] * channels * like.element_size()
     free = free_for(needed, like.device)
     if needed > free:
-        raise ResourceError(
-            f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
-            "smaller images, fewer cameras at once, or parts of an image with RasterizeOptions(window=...)"
-        )
+        size = f"{window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}"
+        raise ResourceError(f"images of {size}: render smaller images, fewer cameras at once, or a window of an image")
 
 
 Layer = tuple[Tensor | None, Tensor]
