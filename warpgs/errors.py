@@ -1,6 +1,7 @@
 """Errors with their exit codes, and the words that help: the nearest name, the documentation of a field."""
 
 import ast
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -9,7 +10,7 @@ import itertools
 import os
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -88,6 +89,19 @@ def expect(condition: object, what: str) -> None:
     """Raise a `MalformedError` unless a condition holds; ``what`` is wrong with the content otherwise."""
     if not condition:
         raise MalformedError(what)
+
+
+Kinds = type[Exception] | tuple[type[Exception], ...]
+
+
+@contextlib.contextmanager
+def explained(what: str, fix: str, errors: Kinds = OSError, kind: type[WarpgsError] = DataError) -> Iterator[None]:
+    """Turn errors of the block into one that says what is wrong, why in brackets, and the fix."""
+    try:
+        yield
+    except errors as e:
+        why = getattr(e, "strerror", None) or next(iter(str(e).splitlines()), type(e).__name__)
+        raise kind(f"{what} ({why}); {fix}") from e
 
 
 def listed(names: Sequence[object], most: int = 100) -> str:

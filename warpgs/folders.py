@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 from filelock import lock_descriptor
 
-from warpgs.errors import ResourceError
+from warpgs.errors import ResourceError, explained
 
 # Folders that this process writes into: the folder that the user names may be a link; below it no link is followed.
 #
@@ -362,9 +362,7 @@ def cache_home() -> Path | None:
 def private_folder() -> Path:
     """Return a new folder that only this user can read or write (mode 0700), removed when Python ends; one for each process."""
     stack = contextlib.ExitStack()
-    try:
+    with explained("no temporary folder can be written", "set TMPDIR (TEMP on Windows)", kind=ResourceError):
         made = stack.enter_context(temporary_folder())
-    except OSError as e:
-        raise ResourceError(f"no temporary folder can be written ({e.strerror or e}); set TMPDIR (TEMP on Windows)") from e
     atexit.register(stack.close)
     return made.path

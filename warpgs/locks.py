@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from warpgs.errors import FolderHeldError, ResourceError, UsageError
+from warpgs.errors import FolderHeldError, ResourceError, UsageError, explained
 from warpgs.files import LOCK, remove_leftovers, writable, writing_into
 from warpgs.folders import LOCKED, Folder, Temporary, cache_home, lock, open_folder, sweep, sweep_temporary_files, unlock
 
@@ -162,7 +162,7 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
         raise UsageError("--engine slurm needs a home folder for its job files; name another folder with --slurm-folder")
     base = (base or home / "warpgs" / "slurm").absolute()
     with contextlib.ExitStack() as stack:
-        try:
+        with explained(f"{base}: not writable", "name another private, shared --slurm-folder", kind=ResourceError):
             base.mkdir(mode=0o700, parents=True, exist_ok=True)
             base = base.resolve()
             if (others := open_to_others(base)) is not None:
@@ -172,6 +172,4 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
             sweep(above)
             made = stack.enter_context(Temporary(above))
             above.mkdir(made.name, 0o700)
-        except OSError as e:
-            raise ResourceError(f"{base}: not writable ({e.strerror or e}); name another private, shared --slurm-folder") from e
         yield made.path

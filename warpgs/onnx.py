@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from warpgs.device import usable_cores
-from warpgs.errors import DataError, ResourceError, expect
+from warpgs.errors import DataError, ResourceError, expect, explained
 from warpgs.files import read_file
 
 # Check of an ONNX file by its bytes, before onnxruntime loads it: nothing outside the file may be loaded.
@@ -91,7 +91,7 @@ def _walk(kind: str, message: Message, depth: int = 0) -> Iterator[tuple[str, Me
 
 def check_onnx(data: bytes, path: Path) -> None:
     """Check that bytes are an ONNX model without external data and without custom operators."""
-    try:
+    with explained(f"{path}: not an ONNX model", "export it again, as with `torch.onnx.export`", (ValueError, IndexError)):
         model = _message(memoryview(data))
         graphs = sum(n == MODEL_GRAPH and isinstance(v, memoryview) for n, v in model)
         if graphs != 1 or not any(n == MODEL_OPSET for n, _ in model):
@@ -122,8 +122,6 @@ def check_onnx(data: bytes, path: Path) -> None:
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
                     raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
-    except (ValueError, IndexError) as e:
-        raise DataError(f"{path}: not an ONNX model ({e}); give a file written by `torch.onnx.export` or a similar tool") from e
 
 
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
@@ -223,11 +221,9 @@ class Model:
         self.path = Path(path)
         data = read_model(self.path)
         self.session, self.sha256 = start_session(data, self.path, provider, threads), hashlib.sha256(data).hexdigest()
-        try:
+        with explained(f"{path}: the name of an input or output is not UTF-8", "export it again", UnicodeDecodeError):
             self.inputs: list[tuple[str, str, list]] = [(i.name, i.type, i.shape) for i in self.session.get_inputs()]
             self.outputs: list[str] = [o.name for o in self.session.get_outputs()]
-        except UnicodeDecodeError as e:
-            raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
 
     @property
     def title(self) -> str:

@@ -18,7 +18,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, explained
 from warpgs.process import ignored_signals, say
 
 if TYPE_CHECKING:
@@ -445,11 +445,9 @@ def join(device: str) -> Ranks:
     agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # torchrun itself holds the store then
     cuda = device != "cpu" and (device.startswith("cuda") or torch.cuda.is_available())
     home = _stay_home(address)
-    try:
+    with explained(f"rank {rank} of {count} cannot reach {address}:{port}", "start them all", RuntimeError, kind=ResourceError):
         store = _store(address, port, count, home, hosts=rank == 0 and not agent)
         watch = RankWatch(rank, count, store, _store(address, port, count, home, hosts=False))
-    except RuntimeError as e:
-        raise ResourceError(f"rank {rank} of {count} cannot reach {address}:{port} ({str(e).splitlines()[0][:200]})") from e
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
     if cuda:
@@ -458,11 +456,9 @@ def join(device: str) -> Ranks:
             raise ResourceError(f"{there}. Start fewer processes, or give --device cpu")
         torch.cuda.set_device(local)
     watch.meet(JOIN_SECONDS)
-    try:
+    with explained(f"{backend} cannot connect the {count} ranks", "start them again", RuntimeError, kind=ResourceError):
         group = dist.PrefixStore("group", store)
         dist.init_process_group(backend, store=group, rank=rank, world_size=count, timeout=EXCHANGE_TIME)
-    except RuntimeError as e:
-        raise ResourceError(f"{backend} cannot connect the {count} ranks ({str(e).splitlines()[0][:200]})") from e
     if rank == 0:
         torchrun = [("torchrun", *at) for at in listening_at(os.getppid()) if agent and at[1] == port]
         say_what_is_open([*(("rank 0", *at) for at in listening_at()), *torchrun])

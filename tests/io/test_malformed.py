@@ -295,10 +295,13 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
         ({"mask_path": "m.png"}, r"frame 1 .*: its mask .*m.png is missing; restore it, or remove mask_path"),
         ({"file_path": "images/photo0.png"}, r"the image 'images/photo0.png' is listed twice"),
         ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be over 0."),
-        ({"fl_x": True}, r"frame 1 .*: fl_x must be a finite number, not True"),
-        ({"fl_x": 10**400}, r"frame 1 .*: fl_x must be a finite number"),
-        ({"cx": "8"}, r"frame 1 .*: cx must be a finite number, not '8'; write it .* without quotes"),
-        *(({"fl_x": n}, rf"frame 1 .*: fl_x must be a finite number, not {n}") for n in (np.nan, np.inf, -np.inf)),
+        ({"fl_x": True}, r"frame 1 .*: not a number .fl_x must be a finite number, not True"),
+        ({"fl_x": 10**400}, r"frame 1 .*: not a number .fl_x must be a finite number"),
+        ({"cx": "8"}, r"frame 1 .*: not a number .cx must be a finite number, not '8'.; write it without quotes"),
+        *(
+            ({"fl_x": n}, rf"frame 1 .*: not a number .fl_x must be a finite number, not {n}")
+            for n in (np.nan, np.inf, -np.inf)
+        ),
         ({"transform_matrix": [[np.nan] * 4] * 4}, r"frame 1 .*: the pose is not finite"),
         ({"w": 0}, r"frame 1 .*: the camera's image size 0 x 12 px is impossible"),
         ({"w": 30}, r"photo1.png: the image is 16 x 12 px, its camera 30 x 12"),
@@ -396,7 +399,7 @@ def test_numpy_files_that_are_none(name, write, tmp_path):
             f.write(b"\0" * 64)
         else:
             f.truncate(2**24 + 1)  # of which zipfile would make ten times its size of a table of contents
-    refused(tmp_path, rf"{name}: cannot be read as (a numpy array|an archive of arrays \(OSError: .*is larger than 16 MiB)")
+    refused(tmp_path, rf"{name}: cannot be read as (a numpy array|an archive of arrays \(is larger than 16 MiB)")
     if name.endswith("npy"):
         with (tmp_path / name).open("wb") as f:
             np.savez(f, a=np.zeros(3))

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from warpgs.errors import DataError, MalformedError, UsageError, expect
-from warpgs.files import open_input, read_input, unread_reason, write_bytes, write_json
+from warpgs.errors import DataError, MalformedError, UsageError, expect, explained
+from warpgs.files import open_input, read_input, write_bytes, write_json
 from warpgs.geometry import checked_normalization, convert_gaussians, rotate
 from warpgs.plugins import Registry, returned
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
@@ -255,10 +255,8 @@ unknown methods as NotImplementedError, and seeks before the start as OSError.""
 @contextmanager
 def reading(path: Path, whole: bool = False) -> Iterator[BinaryIO]:
     """Open a file, or read the ``whole`` file; errors of opening and of decoding become a DataError."""
-    try:
+    with explained(f"{path}: cannot be read", "check the path and its permissions"):
         file: BinaryIO = io.BytesIO(read_input(path)) if whole else open_input(path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
     try:
         with file, np.errstate(all="ignore"):  # infinities and NaN are named afterwards, with their Gaussian
             yield file

@@ -7,13 +7,13 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, expect, listed
+from warpgs.errors import DataError, expect, explained, listed
 from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, open_input, ply_header, read_file
 from warpgs.geometry import pose_of
 from warpgs.io import folder as scenes
@@ -110,13 +110,13 @@ def origin_stated(path: Path) -> np.ndarray:
     return checked_origin(words[2:], str(path)) if words[:2] == ["#", ORIGIN] else np.zeros(3)
 
 
-@contextmanager
-def understood(where: str, *errors: type[Exception]) -> Iterator[None]:
+PARSING = (ValueError, LookupError, OverflowError, TypeError, AttributeError)
+"""Errors of parsing."""
+
+
+def understood(where: str, *errors: type[Exception]) -> AbstractContextManager[None]:
     """Turn errors of parsing, and others that are named, into a DataError that names the place."""
-    try:
-        yield
-    except (ValueError, LookupError, OverflowError, *errors) as e:
-        raise DataError(f"{where}: cannot be understood ({e}); write the file again") from e
+    return explained(f"{where}: cannot be understood", "write the file again", (*PARSING, *errors))
 
 
 NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:ind|qnan|snan)\d*)", re.IGNORECASE)
@@ -295,7 +295,7 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
     See `_cloud` for ``notes``.
     """
     data = read_file(path, fix="fix its permissions or copy it again")
-    try:
+    with explained(f"{path}: the points cannot be understood", "export them again as PLY, or remove the file", PARSING):
         elements, start, text = ply_header(data[:MAX_HEADER_BYTES])
         name, count, properties = elements[0] if elements else ("", 0, [])
         kinds, body = dict(properties), data[start:]
@@ -309,8 +309,6 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
         else:
             table = np.frombuffer(body, np.dtype(properties), count)
             values = {n: table[n].astype(np.float64) for n in kinds}
-    except (ValueError, OverflowError) as e:
-        raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
     rgb = next((c for c in COLORS if kinds.keys() >= set(c)), [])
     colors = np.stack([values[c] for c in rgb], 1) if rgb else np.full((count, 3), 127.0)
     if not rgb and notes is not None:

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpgs.errors import DataError, ResourceError, expect
-from warpgs.files import read_input, read_start, unread_reason
+from warpgs.errors import DataError, ResourceError, expect, explained
+from warpgs.files import read_input, read_start
 
 if TYPE_CHECKING:
     from PIL import ImageFile
@@ -91,12 +91,10 @@ BYTES_PER_PIXEL = 32
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None = None) -> bytes:
     """Return the bytes of an image file, or its first ``start``; files too large for ``max_pixels`` pixels are rejected."""
-    try:
+    with explained(f"{path}: the image cannot be read", "restore it, or remove its camera"):
         if start is not None:
             return read_start(path, start)
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
-    except OSError as e:
-        raise DataError(f"{path}: the image cannot be read ({unread_reason(e)}); restore it, or remove its camera") from e
 
 
 # Size and damage. Functions take the bytes of a file, and raise a ValueError with the reason as part of a sentence.

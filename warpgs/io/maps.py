@@ -6,8 +6,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
-from warpgs.files import PIECE, inside, open_input, unread_reason
+from warpgs.errors import DataError, UsageError, expect, explained
+from warpgs.files import PIECE, inside, open_input
 from warpgs.geometry import CENTRAL
 from warpgs.io.image_files import MAX_PIXELS, decode_png
 from warpgs.io.images import LoadedImage, ReadOptions, turn_upright, undistortion_maps
@@ -62,12 +62,9 @@ def _find(files: dict[str, Path], image: Path) -> tuple[Path | None, Path | None
 def mapped_array(path: Path, fix: str) -> np.memmap:
     """Return the array of an NPY file, which stays in the file, for its shape and type alone; `array_numbers` reads it."""
     # numpy compares the shape with the file's size
-    try:
+    with explained(f"{path}: cannot be read as a numpy array", fix, Exception):  # numpy raises a dozen types
         open_input(path).close()
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as e:  # numpy raises a dozen types on malformed files
-        why = unread_reason(e) if isinstance(e, OSError) else f"{type(e).__name__}: {e}"
-        raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
     if not isinstance(found, np.memmap):
         found.close()
         raise DataError(f"{path}: is an archive of arrays, not one array; {fix}")
@@ -79,15 +76,14 @@ def array_numbers(path: Path, found: np.memmap, kind: type | np.dtype, fix: str)
     # a read of mapped memory ends the process (SIGBUS) if the file has become shorter, or its disk fails
     numbers = np.empty(found.shape, kind, order="C" if found.flags.c_contiguous else "F")
     flat, size, step = numbers.reshape(-1, order="A"), found.dtype.itemsize, PIECE // found.dtype.itemsize
-    try:
-        with open_input(path) as file, np.errstate(over="ignore", invalid="ignore"):
-            file.seek(found.offset)
-            for at in range(0, flat.size, step):
-                part = flat[at : at + step]
-                part[:] = np.frombuffer(file.read(part.size * size), found.dtype)
-    except (OSError, ValueError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else "it has become shorter while it was read"
-        raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
+    with explained(f"{path}: cannot be read as a numpy array", fix, (OSError, ValueError)), open_input(path) as file:
+        file.seek(found.offset)
+        for at in range(0, flat.size, step):
+            part = flat[at : at + step]
+            data = file.read(part.size * size)
+            expect(len(data) == part.size * size, "it has become shorter while it was read")
+            with np.errstate(over="ignore", invalid="ignore"):
+                part[:] = np.frombuffer(data, found.dtype)
     return numbers
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from warpgs import files, schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, explained
 from warpgs.io.folder import all_readers, loaders
 from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses import photographs as photos
@@ -180,10 +180,8 @@ def report_lines(record: dict[str, Any]) -> list[str]:
 def read_poses_record(folder: Path) -> dict[str, Any]:
     """Read poses.json of a scene whose poses were found."""
     path = folder / JSON
-    try:
+    with explained(f"{path}: cannot be read", "find the poses again with `warpgs poses`", (OSError, schema.SchemaError)):
         return schema.read(path, folder, _RECORD)
-    except (OSError, schema.SchemaError) as e:
-        raise DataError(f"{path}: cannot be read ({e}); find the poses again with `warpgs poses`") from e
 
 
 MIN_PHOTOGRAPHS = 3

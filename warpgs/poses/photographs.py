@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, install_extras, listed
-from warpgs.files import UNDECODABLE, inside, make_folder, read_start, unread_reason, write_bytes, write_json
+from warpgs.errors import DataError, UsageError, explained, install_extras, listed
+from warpgs.files import UNDECODABLE, inside, make_folder, read_start, write_bytes, write_json
 from warpgs.io import image_files
 from warpgs.io.images import list_images, turn_upright
 from warpgs.process import ProcessFailed, Say, answer, end_with_parent, hidden_stderr, python_lines, silent, utf8_name
@@ -88,10 +88,8 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
 
 def _check_container(path: Path) -> None:
     """Raise a DataError if a file is not a video container: FFmpeg would follow a playlist to other files."""
-    try:
+    with explained(f"{path}: the video cannot be read", "fix its permissions or copy it again"):
         start = read_start(path, START)
-    except OSError as e:
-        raise DataError(f"{path}: the video cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
     avi, matroska = start[:4] == b"RIFF" and start[8:] == b"AVI ", start[:4] == b"\x1a\x45\xdf\xa3"
     if not (avi or matroska or start[4:8] in BOXES):
         raise DataError(f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames")

@@ -8,6 +8,7 @@ import logging
 import shlex
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpgs.errors import DataError, ResourceError, UsageError, install_extras
+from warpgs.errors import DataError, ResourceError, UsageError, explained, install_extras
 from warpgs.files import read_file, read_input, remove_leftovers, write_bytes, write_text
 from warpgs.folders import temporary_folder
 from warpgs.onnx import check_onnx, start_session
@@ -35,8 +36,9 @@ def onnx_bytes(network: torch.nn.Module, image: Tensor, outputs: Sequence[str], 
     exporter = logging.getLogger("torch.onnx")
     before = exporter.level
     exporter.setLevel(logging.ERROR)
+    full = explained("temporary files cannot be written", "free disk space, or set TMPDIR", kind=ResourceError)
     try:
-        with temporary_folder() as folder, warnings.catch_warnings():
+        with full, temporary_folder() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             path = folder.path / "network.onnx"
             torch.onnx.export(
@@ -44,8 +46,6 @@ def onnx_bytes(network: torch.nn.Module, image: Tensor, outputs: Sequence[str], 
                 dynamic_shapes=None if sizes is None else (sizes,), dynamo=True, external_data=False, verbose=False,
             )  # fmt: skip
             return path.read_bytes()
-    except OSError as e:
-        raise ResourceError(f"temporary files cannot be written ({e.strerror or e}); free disk space, or set TMPDIR") from e
     finally:
         exporter.setLevel(before)
 
@@ -233,10 +233,8 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
         )  # fmt: skip
         return _OneOutput(DPTForDepthEstimation(config), "predicted_depth")
     name = request.weights or DPT_WEIGHTS
-    try:
+    with explained(f"{name}: not loaded", "give a folder of weights with --weights", (OSError, ValueError)):
         return _OneOutput(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
-    except (OSError, ValueError) as e:
-        raise DataError(f"{name}: not loaded ({str(e).splitlines()[0][:200]}); give a folder of weights with --weights") from e
 
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
@@ -265,10 +263,8 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
             return grow(total, pixel_values.shape[-2:])
 
     network = FCN()
-    try:
+    with _loading(request.weights, RuntimeError):
         network.load_state_dict(network.state_dict() if given is None else given)
-    except RuntimeError as e:
-        raise _no_weights(request.weights, e) from e
     return network
 
 
@@ -280,14 +276,12 @@ def _own_weights(path: str | None) -> dict[str, Tensor]:
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    try:
+    with _loading(path, (OSError, SafetensorError)):
         return load(read_input(path))
-    except (OSError, SafetensorError) as e:
-        raise _no_weights(path, e) from e
 
 
-def _no_weights(path: str | None, error: Exception) -> DataError:
-    return DataError(f"{path}: these are not weights of fcn-resnet18 ({str(error).splitlines()[0][:200]})")
+def _loading(path: str | None, errors: Any) -> AbstractContextManager[None]:
+    return explained(f"{path}: these are not weights of fcn-resnet18", "give others with --weights", errors)
 
 
 def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
@@ -312,12 +306,10 @@ class _OneOutput(torch.nn.Module):
 def build(request: ExportRequest) -> torch.nn.Module:
     """Return the network in torch, ready for inference: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w]."""
     makers = {"dpt": _dpt, "fcn-resnet18": _fcn_resnet18, "fcn-resnet50": _fcn_resnet50}
-    try:
+    with explained(f"{request.model}: the export needs another package", REMEDY, ImportError, kind=ResourceError):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             return makers[request.model](request).eval()
-    except ImportError as e:
-        raise ResourceError(f"{request.model}: the export needs {e.name or e}; {REMEDY}") from e
 
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:

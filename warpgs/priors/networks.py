@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError
-from warpgs.files import read_input, unread_reason, write_bytes
+from warpgs.errors import DataError, ResourceError, explained
+from warpgs.files import read_input, write_bytes
 from warpgs.folders import cache_home, private_folder
 from warpgs.onnx import Model, fixed_size
 from warpgs.process import say
@@ -161,14 +161,11 @@ def side_file(model: Path) -> Path:
 
 def read_side_file(model: Path) -> dict:
     """Return the entries of the JSON file beside a model; none without such a file."""
-    path = side_file(model)
+    path, fix = side_file(model), f"fix it, with keys out of {', '.join(KEYS)}, or remove it"
     if not os.path.lexists(path):
         return {}
-    try:
+    with explained(f"{path}: cannot be read", fix, (OSError, schema.SchemaError)):
         return schema.read(path, rule=_DESCRIPTION)
-    except (OSError, schema.SchemaError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else e
-        raise DataError(f"{path}: cannot be read ({why}); fix it, with keys out of {', '.join(KEYS)}, or remove it") from e
 
 
 def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Preprocessing, list[str]]:

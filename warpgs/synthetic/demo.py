@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, explained
 from warpgs.files import filling, is_empty, make_folder, write_bytes
 from warpgs.geometry import look_at, matmul, pose_of
 from warpgs.process import Say, counted, silent
@@ -206,12 +206,10 @@ def _write(folder: Path, views: int, least: int, train: int, size: tuple[int, in
         raise UsageError(f"a demo of this kind needs at least {least} views ({train} to fit, the rest held out), not {views}")
     if min(size) < MIN_SIDE:
         raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {size[0]} x {size[1]}")
-    try:
+    with explained(f"{folder} cannot be read", "name a folder that you may write to", kind=ResourceError):
         if folder.exists() and not (folder.is_dir() and is_empty(folder)):
             what = "is not empty, and the demo overwrites nothing" if folder.is_dir() else "is a file"
             raise UsageError(f"{folder} {what}; name a new or an empty folder")
-    except OSError as e:
-        raise ResourceError(f"{folder} cannot be read ({e.strerror or e}); name a folder that you may write to") from e
     with filling(folder) as temporary:  # before the work: a folder that cannot be made is reported at once
         for path, content in contents().items():
             make_folder((temporary / path).parent)
