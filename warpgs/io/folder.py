@@ -19,7 +19,7 @@ import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
 from warpgs.device import machine_memory, usable_cores
-from warpgs.errors import DataError, UsageError, listed, shortened
+from warpgs.errors import DataError, UsageError, expect, explained, listed, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, pose_at, pose_of, rotation_matrices
 from warpgs.io.image_files import READ, decode, unread_note
@@ -262,12 +262,9 @@ class SceneFolder:
             DataError: The name cannot be one of a file, or points outside.
         """
         usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
-        try:
-            encoded = usable and str(name).encode("utf-8", "surrogateescape")
-        except UnicodeEncodeError:
-            encoded = b""
-        if not encoded:
-            raise DataError(f"{where}: {str(name)[:80]!r} is not a file name; name an image file")
+        with explained(f"{where}: {str(name)[:80]!r} is not a file name", "name an image file", ValueError):
+            expect(usable, "it is empty, too long or no text")
+            str(name).encode("utf-8", "surrogateescape")
         path = folder / str(name)
         if "\\" in str(name) and not path.is_file():
             path = folder / str(name).replace("\\", "/")  # written on Windows
