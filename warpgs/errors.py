@@ -101,7 +101,8 @@ def explained(what: str, fix: str, errors: Kinds = OSError, kind: type[WarpgsErr
         yield
     except errors as e:
         why = getattr(e, "strerror", None) or next(iter(str(e).splitlines()), type(e).__name__)
-        raise kind(f"{what} ({why}); {fix}") from e
+        at = f"{e.filename}: " if isinstance(e, OSError) and e.filename and str(e.filename) not in what else ""
+        raise kind(f"{what} ({at}{why}); {fix}") from e
 
 
 def listed(names: Sequence[object], most: int = 100) -> str:
@@ -122,11 +123,10 @@ def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
 
 def similar_folder(path: Path) -> str:
     """Return `did_you_mean` for the name of a missing folder among the folders beside it."""
-    try:
+    with contextlib.suppress(OSError):  # without the folder around it there is nothing to suggest
         with os.scandir(path.parent) as entries:
             return did_you_mean(path.name, [e.name for e in entries if e.is_dir()])
-    except OSError:  # without the folder around it there is nothing to suggest
-        return ""
+    return ""
 
 
 def install_extras(*names: str) -> str:

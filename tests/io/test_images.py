@@ -334,11 +334,11 @@ def test_masks_that_cannot_be_used(tmp_path):
     path = tmp_path / "masks" / "photo0.png"
     for i in range(scenes.VIEWS):
         scenes.save(path.with_name(f"photo{i}.png"), np.zeros((12, 16), np.uint8))
-    scenes.refused(tmp_path, r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
+    scenes.refused(tmp_path, r"has 0 usable views, not at least 2 \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
     for i in range(1, scenes.VIEWS):
         path.with_name(f"photo{i}.png").unlink()
     scenes.save(path, np.full((12, 30), 255, np.uint8))
-    scenes.refused(tmp_path, r"photo0.png: its mask is 30 x 12 px, the image 16 x 12")
+    scenes.refused(tmp_path, r"photo0.png: its mask is 30 x 12 px, of another aspect")
     path.write_bytes(b"no image")
     scenes.refused(tmp_path, r"masks/photo0.png: the image cannot be decoded")
     scenes.save(path, np.full((24, 32), 255, np.uint8))  # twice the size is the same mask

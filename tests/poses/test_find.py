@@ -217,9 +217,7 @@ def test_a_reconstruction_deep_in_the_photographs_is_named(tmp_path, photographs
     (folder / "run" / "scene" / "poses.json").touch()
     assert not list(models_below(folder))
     scenes.write_files(folder / "out" / "my model", scenes.colmap_txt())
-    with pytest.raises(
-        UsageError, match=r"holds a COLMAP reconstruction in out/my model: `warpgs fit .* --reconstruction out/my"
-    ):
+    with pytest.raises(UsageError, match=r"holds poses: use `warpgs fit .* --reconstruction out/my"):
         find_poses(folder, tmp_path / "out")
     request = SceneRequest(path=str(folder), reconstruction="out/my model")
     assert with_poses(request, None, print) == (request, [])
@@ -440,7 +438,7 @@ def test_records_reasons_and_advice():
         matches={(0, 1): 200, (1, 2): 90, (3, 4): 40, (4, 5): 50, (2, 4): 8, (1, 5): 5, (5, 6): 20},
     )  # fmt: skip
     bridge, other = advice(apart, [*names, "f", "g"])
-    assert "between e and c" in bridge and bridge.endswith("3 photographs form a separate group, d to f")
+    assert "between e and c" in bridge and bridge.endswith("3 form a separate group, d to f")
     assert "photographs from g to the others" in other, "a photograph without a pose is no place to start from"
     assert (
         "from d to the photographs outside its group" in advice(dataclasses.replace(apart, matches={}), [*names, "f", "g"])[0]

@@ -83,8 +83,7 @@ def _points(scene: SceneFolder, path: Path, views: list[View]) -> tuple[PointClo
     some = points.points[:: max(1, len(points) // COMPARED_POINTS)]
     seen = {i for view in views for i in seen_pixels(view.camera, some)[0].tolist()}
     if len(seen) < MIN_SHARE * len(some):
-        where = "export cameras and points in the same coordinate system"
-        return None, [f"the points of {ply.name} are left out: {len(seen) / len(some):.0%} of them are in some view; {where}"]
+        return None, [f"the points of {ply.name} are left out, as few are in a view; export both in one coordinate system"]
     return points, [f"points taken from {ply.name}", *(bad or [])]
 
 

@@ -7,7 +7,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -228,8 +228,7 @@ def without_unaligned(
     if strict or not kept or len(kept) == len(poses):
         return poses, []
     names = listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
-    count = f"{len(poses) - len(kept)} of {len(poses)} images of {file.name}"
-    return kept, [f"left out: {count} have a pose or camera that is not finite: {names}"]
+    return kept, [f"left out: {len(poses) - len(kept)} of {len(poses)} images, as pose or camera is not finite: {names}"]
 
 
 def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) -> Iterator[tuple[str, Lens, np.ndarray]]:
@@ -365,16 +364,14 @@ def reconstruction(root: Path, named: str | None = None) -> tuple[Model | None, 
     names = [m[0].relative_to(root).as_posix() for m in models]
     counts = ", ".join(f"{name}: {size}" for name, size in zip(names, sizes))
     chosen = best[0].relative_to(root).as_posix()
-    among = f"of {len(models)} reconstructions (images in {counts})"
-    return best, f"{chosen} is the largest {among}; --reconstruction FOLDER takes another"
+    return best, f"{chosen} is the largest reconstruction (images in {counts}); --reconstruction FOLDER takes another"
 
 
 def _size(model: Model) -> int:
     """Return the number of posed images of a complete reconstruction; 0 for a damaged file, so that another one is taken."""
-    try:
+    with suppress(DataError):
         return len(read_poses(model[0] / f"images.{model[1]}"))
-    except DataError:
-        return 0
+    return 0
 
 
 def image_base(root: Path, model: Path) -> str | None:
@@ -429,8 +426,7 @@ def _image_paths(
     found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
     if images != scene.root / base and len(lost) == len(names) == len(files) > len(found):
         pairs = dict(zip(sorted(names), files))
-        order = f"images of {images.name} matched in sorted order, because their names differ"
-        return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
+        return pairs, [f"images of {images.name} matched in sorted order: {min(names)} is {pairs[min(names)].name}"]
     for n in (n for n in outside if n not in found):
         elsewhere = scenes.is_absolute(n) and not Path(n).exists()
         paths[n] = images / scenes.missing_name(n) if elsewhere else scene.child(images, n, where)  # which refuses
@@ -473,9 +469,7 @@ def add_views(
 class ColmapReader(Reader):
     """COLMAP reconstructions, binary or text, with their image folder."""
 
-    description = (
-        "sparse/0, sparse, dense/0/sparse, colmap/sparse/0 or the folder itself with cameras and images .bin/.txt (COLMAP)"
-    )
+    description = "sparse/0, sparse, dense/0/sparse, colmap/sparse/0 or the folder with cameras and images .bin/.txt (COLMAP)"
     priority = 10
 
     def probe(self, folder: Path) -> Probe | None:

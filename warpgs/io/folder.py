@@ -142,8 +142,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     first = 1 if min(ids) == 1 and not named_by_dtu(names) else 0  # files renamed 001, 002, ... count from one
     by_id = {i - first: name for i, name in zip(ids, names)}
     if missing := [i for i in range(max(least, len(names))) if i not in by_id]:
-        counted = f"counted from 0, names run from {names[0]} to {names[-1]}"
-        raise DataError(f"{where}: images with the ids {listed(missing, 8)} are missing ({counted}); restore them")
+        raise DataError(f"{where}: images with the ids {listed(missing, 8)}, counted from 0, are missing; restore them")
     return {i: by_id[i] for i in wanted}
 
 
@@ -394,8 +393,7 @@ class SceneFolder:
             note = unread_note(folder) or f"missing, or without images ({READ}); put the images into it"
             raise DataError(f"{folder}: {note}")
         largest = others[min(others)]
-        note = f"no full-size folder '{base}': images taken from {largest.name}{how and ', '}{how}"
-        return self.inside(largest), downscale, note
+        return self.inside(largest), downscale, f"no folder '{base}': images taken from {largest.name}{how and ', '}{how}"
 
     def pixel_source(self, by_folder: bool) -> str:
         """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the kind of resampling.
@@ -445,9 +443,8 @@ def matched_note(found: dict[str, Path], place: str, root: Path, noun: str = "im
     """Return the note on names that another file than that of their spelling was ``found`` for; [] for none."""
     if not found:
         return []
-    first, count = min(found), f"{len(found)} {noun}{'s' if len(found) != 1 else ''}"
-    how = "matched by their names without suffix, case or folder"
-    return [f"{count} of {place} {how} ({first} is {found[first].relative_to(root)})"]
+    first, count = min(found), f"{len(found)} {noun}{'s' if len(found) != 1 else ''} of {place}"
+    return [f"{count} matched by their names without suffix, case or folder ({first} is {found[first].relative_to(root)})"]
 
 
 def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: bool) -> list[str]:

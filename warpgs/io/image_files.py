@@ -434,8 +434,8 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         expect(raster is not None and raster.shape[:2] == (height, width), "its pixels cannot be read")
     except (cv2.error, MemoryError, ValueError) as e:
         if isinstance(e, MemoryError) or getattr(e, "code", None) == cv2.Error.StsNoMem:
-            needs = f"{BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB"
-            raise ResourceError(f"{path}: decoding the image needs {needs}; shrink it, or end other programs") from e
+            needs = BYTES_PER_PIXEL * pixels / 2**30
+            raise ResourceError(f"{path}: decoding the image needs {needs:.1f} GiB; shrink it, or end other programs") from e
         reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else e
         raise DataError(f"{path}: the image cannot be decoded: {reason}. Restore it, or save it as PNG") from e
     return raster
@@ -501,10 +501,9 @@ NO_EXIF: Exif = (1, "", "", None)
 
 def read_exif(data: bytes) -> Exif:
     """Return the EXIF values of an image file; damaged values count as missing."""
-    try:
+    with contextlib.suppress(ValueError):
         return parse_exif(_block(data))
-    except ValueError:
-        return NO_EXIF
+    return NO_EXIF
 
 
 def parse_exif(block: bytes) -> Exif:

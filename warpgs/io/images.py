@@ -346,8 +346,7 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
         return mask
     # rounding a size may change it by one pixel of the smaller raster
     if abs(mask.shape[1] * height - mask.shape[0] * width) > max(height, width, *mask.shape):
-        size = f"{mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}"
-        raise DataError(f"{path}: its mask is {size}: the aspects differ. Give a mask made from this image")
+        raise DataError(f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, of another aspect. Make it from this image")
     resized = _resize(mask.astype(np.float32), width, height)
     return resized > 0.5 if mask.dtype == bool else resized
 
@@ -484,5 +483,4 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         empty += float(nothing.mean()) / len(views)
         alpha = 1 - nothing.astype(np.float32)
         done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
-    these = f"the dark pixels around the object and in its holes ({empty:.1%} of all pixels)"
-    return done, f"every image shows an object on black: {these} become transparent; --no-black-is-empty keeps them"
+    return done, f"images show an object on black: {empty:.1%} become transparent; --no-black-is-empty keeps them"

@@ -156,8 +156,7 @@ def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
     """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values."""
     raw = read_numbers(path, options.max_pixels)
     if raw.ndim != 3 or raw.shape[2] != 3:
-        shape = " x ".join(map(str, raw.shape))
-        raise DataError(f"{path}: is {shape}, normals need three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
+        raise DataError(f"{path}: is {list(raw.shape)}, not of three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
     black = (raw == 0).all(-1)
     values = raw.astype(np.float32)
     if raw.dtype.kind == "u":
@@ -170,8 +169,7 @@ def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
         raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
-        fix = "save PNG as (n + 1) / 2, or NPY with unit vectors"
-        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals; {fix}")
+        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals; save PNG as (n + 1) / 2, or NPY as it is")
     known &= np.abs(lengths - 1) <= UNIT_TOLERANCE
     normals = np.where(known[..., None], values / np.where(known, lengths, 1)[..., None], 0).astype(np.float32)
     if options.normal_axes == "opengl":
@@ -310,8 +308,7 @@ class GivenMaps:
         if not known.any():
             raise DataError(f"{path}: no pixel inside the mask has a normal; remove the file: normals are optional")
         if away > 0.5:
-            other = "opencv" if self.options.normal_axes == "opengl" else "opengl"
-            raise DataError(f"{path}: {away:.0%} of its normals face away from the camera; give --normal-axes {other}")
+            raise DataError(f"{path}: {away:.0%} of its normals face away from the camera; give the other --normal-axes")
         return np.where((along <= 0)[..., None], normals, 0).astype(np.float32)
 
 

@@ -76,8 +76,7 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
     if model not in known:
-        kept = kept if model == FISHEYE else ""
-        raise DataError(f"{where}: camera model {model[:40]} is not supported. Undistort the images{kept}")
+        raise DataError(f"{where}: camera model {model[:40]} is not supported. Undistort the images{kept * (model == FISHEYE)}")
     fisheye = native and bool(model == FISHEYE or frame.get("is_fisheye", shared.get("is_fisheye")))
     number = partial(_number, frame, shared, where=where)
     width, height = (own if (given := number(key)) is None else int(given) for key, own in (("w", width), ("h", height)))
@@ -91,11 +90,10 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
         f.append(focal)
         c.append(side / 2 if center is None else center)
     distortion = [number(k) or 0.0 for k in (("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3"))]
-    unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
-    other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
+    unread = ("k5", "k6", "fisheye_crop_radius", "p1", "p2") if fisheye else UNSUPPORTED_TERMS
+    other = [k for k in unread if frame.get(k, shared.get(k))]
     if other:
-        kept = kept if other[0] == "is_fisheye" else ""
-        raise DataError(f"{where}: {other[0]} is not supported for this lens. Undistort the images{kept}")
+        raise DataError(f"{where}: {other[0]} is not supported here. Undistort the images{kept * (other[0] == 'is_fisheye')}")
     fx = f[0] if f[0] is not None else f[1]
     if fx is None:
         raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown; add one of them")

@@ -1,5 +1,6 @@
 """Photographs and videos that poses are found for: which they are, and their copies as images."""
 
+import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -296,10 +297,9 @@ def scene_name(name: str, data: bytes) -> str:
 
 
 def _format(data: bytes) -> str:
-    try:
+    with contextlib.suppress(ValueError):
         return image_files.format_of(data)
-    except ValueError:
-        return ""
+    return ""
 
 
 def prepare(path: Path, root: Path, small: Path, max_pixels: int = image_files.MAX_PIXELS) -> Photograph:
@@ -334,10 +334,8 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = image_fil
     if photograph.orientation == 1 and kind in ("JPEG", "PNG"):
         write_bytes(target, without_jpeg_metadata(data) if kind == "JPEG" else without_png_metadata(data))
         return
-    colors, alpha = (
-        None if a is None else turn_upright(a, photograph.orientation)
-        for a in image_files.decode(photograph.path, max_pixels, data)
-    )
+    stored = image_files.decode(photograph.path, max_pixels, data)
+    colors, alpha = (None if a is None else turn_upright(a, photograph.orientation) for a in stored)
     assert colors is not None
     pixels = colors[..., ::-1] if alpha is None else np.concatenate([colors[..., ::-1], alpha[..., None]], -1)
     suffix, options = (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]) if kind == "JPEG" else (".png", [])
