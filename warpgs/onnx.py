@@ -117,8 +117,7 @@ def check_onnx(data: bytes, path: Path) -> None:
             count += size(part) if kind == "node" else 0
             expect(count <= MAX_NODES, f"more than {MAX_NODES:,} nodes once its functions are inlined")
             if kind == "tensor" and any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in part):
-                weights = f"the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not read"
-                raise DataError(f"{path}: {weights}. Save it as one file: `onnx.save(onnx.load(FILE), OUT)`")
+                raise DataError(f"{path}: its weights are in another file. Save one file: `onnx.save(onnx.load(FILE), OUT)`")
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
                     raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
@@ -140,8 +139,7 @@ def read_model(path: Path) -> bytes:
 
 def _first_line(error: Exception) -> str:
     """Return the first line of an error's message, at most 200 letters."""
-    lines = str(error).strip().splitlines()
-    return lines[0][:200] if lines else type(error).__name__
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)[:200]
 
 
 T = TypeVar("T")
@@ -198,8 +196,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Any:
         if provider != "cpu":
             start_session(data, path, "cpu", threads)  # DataError where the file is at fault
             raise ResourceError(f"--onnx-provider {provider}: onnxruntime cannot use it ({_first_line(e)}). {remedy}") from e
-        why = f"onnxruntime {ort.__version__} cannot load it ({_first_line(e)})"
-        raise DataError(f"{path}: {why}; export it again, perhaps with an older operator set") from e
+        raise DataError(f"{path}: onnxruntime cannot load it ({_first_line(e)}); export it again, with older operators") from e
     # onnxruntime continues without a provider if its libraries are missing
     if PROVIDERS[provider] not in session.get_providers():
         raise ResourceError(f"--onnx-provider {provider}: onnxruntime finds no {provider} libraries or device. {remedy}")
@@ -236,9 +233,8 @@ class Model:
 
         feed = {name: np.ascontiguousarray(image) for (name, _, _), image in zip(self.inputs, images, strict=True)}
         options = RunOptions()
-        try:
+        refused = f"{self.path}: onnxruntime refuses an input of {' x '.join(map(str, images[0].shape))}"
+        # onnxruntime's errors share no base but Exception
+        with explained(refused, f"describe it in {self.path.name}.json", Exception):
             answer = _interruptible(lambda: self.session.run(names, feed, options), lambda: setattr(options, "terminate", True))
             return [np.asarray(output) for output in answer]
-        except Exception as e:  # onnxruntime's errors share no base but Exception
-            refused = f"onnxruntime refuses an input of {' x '.join(map(str, images[0].shape))} ({_first_line(e)})"
-            raise DataError(f"{self.path}: {refused}; describe it in {self.path.name}.json") from e

@@ -109,7 +109,7 @@ def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
         check(p, (32, 64))
     text = "\n".join(notes)
     assert "gave the foreground of a.png" in text
-    assert "no score for c.png, 0.png, 1.png, 2.png, 3.png and 2 more views, which have hardly any foreground" in text
+    assert "no score for c.png, 0.png, 1.png, 2.png, 3.png and 2 more, which have hardly any foreground" in text
 
 
 def test_regions_and_classical_sources_say_so():

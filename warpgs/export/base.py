@@ -43,8 +43,7 @@ _AXES = (
 
 def malformed(path: Path, what: str) -> DataError:
     """Return a DataError about a file that does not match its suffix, with the fix."""
-    fix = "Export the model again, or use another format."
-    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. {fix}")
+    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export it again, or use another format")
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
@@ -370,8 +369,7 @@ class Format:
         if self.max_degree == 0:
             arrays["sh"] = arrays["sh"][:, :1]
         elif gaussians.sh_degree > self.max_degree:
-            most = f"{self.suffix} files hold harmonics up to degree {self.max_degree}, not {gaussians.sh_degree}"
-            raise DataError(f"{path}: not written, {most}. Give --sh-degree {self.max_degree}, or write .ply")
+            raise DataError(f"{path}: degree {gaussians.sh_degree} is too high; give --sh-degree {self.max_degree}, or .ply")
         pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
         self.store(path, [returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces])
         if type(self).origin_in is Format.origin_in:

@@ -393,8 +393,7 @@ def _plain(path: Path, file: BinaryIO, notes: list[str]) -> base.Arrays:
         notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
     logits, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and logits.min() >= 0 and logits.max() <= 1 and scales.min() > 0:
-        values = f"all opacities are from {logits.min():.2g} to {logits.max():.2g} and all log scales above 0"
-        notes.append(f"{path}: {values}. If images are foggy, export the model again without activations")
+        notes.append(f"{path}: opacities look activated. If images are foggy, export the model again without activations")
     return arrays
 
 

@@ -29,10 +29,8 @@ REMEDY = install_extras("export")
 
 def onnx_bytes(network: torch.nn.Module, image: Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None) -> bytes:
     """Return the ONNX file of a network for an ``image`` [1, 3, h, w]; ``sizes`` are the sizes that its axes may have."""
-    try:
+    with explained("onnxscript, which writes ONNX for torch, is not installed", REMEDY, ImportError, ResourceError):
         import onnxscript  # noqa: F401
-    except ImportError as e:
-        raise ResourceError(f"onnxscript, which writes ONNX for torch, is not installed; {REMEDY}") from e
     exporter = logging.getLogger("torch.onnx")
     before = exporter.level
     exporter.setLevel(logging.ERROR)
@@ -177,8 +175,7 @@ def export_matcher(out: Path) -> list[str]:
     remove_leftovers(out.parent)
     write_bytes(out, data)
     return [
-        f"{out}: xfeat, images of 96 to {32 * LARGEST} px, {out.stat().st_size / 2**20:.1f} MiB; onnxruntime finds {same:.1%} "
-        "of torch's keypoints",
+        f"{out}: xfeat, images of 96 to {32 * LARGEST} px; onnxruntime finds {same:.1%} of torch's keypoints",
         f"next: warpgs poses PHOTOGRAPHS --matcher {shlex.quote(str(out))} --out scene",
     ]
 
@@ -271,8 +268,7 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
 def _own_weights(path: str | None) -> dict[str, Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if path is None:
-        fix = "give your own with --weights FILE.safetensors, or export fcn-resnet50"
-        raise UsageError(f"fcn-resnet18: no public weights for the 21 VOC classes are known; {fix}")
+        raise UsageError("fcn-resnet18 has no public weights: give --weights FILE.safetensors, or export fcn-resnet50")
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -337,7 +333,6 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     flag = "--depth-model" if is_depth else "--segmentation-model"
     trained = "small and untrained, for tests only; " if request.random_weights else ""
     return [
-        f"{out}: {request.model}, {request.size} x {request.size} px, {out.stat().st_size / 2**20:.1f} MiB; "
-        f"{trained}onnxruntime and torch agree to {difference:.1e} standard deviations",
+        f"{out}: {request.size} x {request.size} px; {trained}onnxruntime agrees to {difference:.1e} standard deviations",
         f"next: warpgs priors show SCENE {flag} {out} --out priors",
     ]

@@ -287,8 +287,7 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
         raise DataError(f"{network.path}: its output has the shape {shape}, not that of one depth map; is it a depth network?")
     if preprocessing.output == "depth":
         if not output.min() > 0:
-            why = f"its smallest depth is {output.min():.3g}, not above 0"
-            raise DataError(f'{network.path}: {why}; for inverse depth, write {{"output": "disparity"}} into its JSON file')
+            raise DataError(f'{network.path}: has depths of 0; for disparity, write {{"output": "disparity"}} into its JSON')
         output = 1 / output
     return unit_range(resize(output, *image.shape[:2]))
 

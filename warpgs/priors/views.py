@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, listed
 from warpgs.onnx import PROVIDERS
 from warpgs.priors import networks
 from warpgs.process import Detail, Say, counted, silent
@@ -219,15 +219,11 @@ def _fall_back(found: list, views: Sequence[View], regions: Sequence[np.ndarray 
         result.append((confidence, boundary, foreground, source))
     reason = "a mask is more reliable than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
-        words = f"semantics: {reason}, so the object's mask or its black background gave the foreground of {_names(replaced)}"
+        words = f"semantics: {reason}, so the object's mask or black background gave the foreground of {listed(replaced, 5)}"
         notes.append(Detail(words) if classical else words)
     if empty:
-        notes.append(f"semantics: no score for {_names(empty)}, which have hardly any foreground and no object mask")
+        notes.append(f"semantics: no score for {listed(empty, 5)}, which have hardly any foreground and no object mask")
     return result
-
-
-def _names(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more views" if len(names) > 5 else "")
 
 
 def view_priors(
