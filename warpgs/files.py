@@ -396,7 +396,6 @@ def disk_is_full(folder: Path, said: str) -> bool:
     """Return whether a process failed because the disk of a folder that it wrote into is full."""
     if any(words in said for words in WORDS):
         return True
-    try:
+    with contextlib.suppress(OSError):
         return shutil.disk_usage(folder).free < MIN_FREE
-    except OSError:
-        return False
+    return False

@@ -35,12 +35,10 @@ def open_to_others(folder: Path, depth: int = 0) -> Path | None:
         return None  # other users cannot enter it
     for level in range(1, depth + 1):
         for path in folder.glob("/".join("*" * level)):
-            try:
+            with contextlib.suppress(FileNotFoundError):  # another process has put its new file in place
                 found = path.lstat()
-            except FileNotFoundError:  # another process has put its new file in place
-                continue
-            if stat.S_ISLNK(found.st_mode) or _writable_by_others(found, trusted):
-                return path
+                if stat.S_ISLNK(found.st_mode) or _writable_by_others(found, trusted):
+                    return path
     return None
 
 
@@ -166,8 +164,7 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
             base.mkdir(mode=0o700, parents=True, exist_ok=True)
             base = base.resolve()
             if (others := open_to_others(base)) is not None:
-                risk = f"not safe for Slurm's job files, as other users can write to {others}"
-                raise UsageError(f"{base}: {risk}; name a private, shared --slurm-folder")
+                raise UsageError(f"{base}: other users can write to {others}; name a private, shared --slurm-folder")
             above = stack.enter_context(open_folder(base))
             sweep(above)
             made = stack.enter_context(Temporary(above))

@@ -180,10 +180,9 @@ is detected directly."""
 
 def machine() -> str:
     """Return a name of the machine and of its process table; process numbers are valid only within one table."""
-    try:
+    with contextlib.suppress(OSError):  # a system other than Linux
         return f"{Path('/proc/sys/kernel/random/boot_id').read_text().strip()} {os.stat('/proc/self/ns/pid').st_ino}"
-    except OSError:  # a system other than Linux
-        return platform.node()
+    return platform.node()
 
 
 def is_gone(process: int) -> bool:
@@ -223,8 +222,7 @@ class RankWatch:
         until = time.monotonic() + seconds
         while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
             if time.monotonic() > until:
-                there = f"rank {missing[0]} of {self.count} did not connect within {seconds:.0f} s"
-                raise ResourceError(f"{there}. Start all ranks with the same MASTER_ADDR and MASTER_PORT")
+                raise ResourceError(f"rank {missing[0]} did not connect; start all with one MASTER_ADDR and MASTER_PORT")
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
@@ -270,8 +268,9 @@ class RankWatch:
         self.leaving.set()
         try:
             first, gone = self.store.add("spoke", 1) == 1, False
-        except RuntimeError:  # the store is gone: no other process can be asked
-            first = gone = self._is_lowest_here()
+        except RuntimeError:  # the store is gone: no other process can be asked; the lowest rank left on this machine speaks
+            below = (self._seen[r][0].split("|", 2) for r in range(self.rank) if r in self._seen)
+            first = gone = all(there != self.here or is_gone(int(process)) for _, process, there in below)
         if first:
             say(line, error=True)
         if gone and self.rank != 0:
@@ -282,11 +281,6 @@ class RankWatch:
         """On rank 0, give the other ranks time to read that the fit ends, since the store may end with this process."""
         if self.rank == 0:
             time.sleep(3 * BEAT_SECONDS)
-
-    def _is_lowest_here(self) -> bool:
-        """Return whether no rank below this one still runs on this machine."""
-        below = (self._seen[r][0].split("|", 2) for r in range(self.rank) if r in self._seen)
-        return all(there != self.here or is_gone(int(process)) for _, process, there in below)
 
     def leave(self) -> None:
         """Tell the other ranks that this process ends normally; all ranks but the first wait for the first to end."""
@@ -452,8 +446,7 @@ def join(device: str) -> Ranks:
     _joined = Group(rank, count, backend, watch)
     if cuda:
         if torch.cuda.device_count() <= local:
-            there = f"rank {rank} needs GPU {local} of this machine, and torch finds {torch.cuda.device_count()}"
-            raise ResourceError(f"{there}. Start fewer processes, or give --device cpu")
+            raise ResourceError(f"rank {rank} needs GPU {local}, which is missing. Start fewer processes, or give --device cpu")
         torch.cuda.set_device(local)
     watch.meet(JOIN_SECONDS)
     with explained(f"{backend} cannot connect the {count} ranks", "start them again", RuntimeError, kind=ResourceError):
