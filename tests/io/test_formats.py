@@ -591,7 +591,7 @@ def lenses_reach(camera) -> np.ndarray:
         ("undistort", {"is_fisheye": True}, "is_fisheye is not supported here.*or fit them with --lenses native"),
         ("native", {"k4": 0.1}, "k4 is not supported here"),
         ("native", {"is_fisheye": True, "p1": 0.1}, "p1 is not supported here"),
-        ("native", {"is_fisheye": True, "fisheye_crop_radius": 9}, "fisheye_crop_radius is not supported for this lens"),
+        ("native", {"is_fisheye": True, "fisheye_crop_radius": 9}, "fisheye_crop_radius is not supported here"),
     ],
 )
 def test_errors_name_the_way_to_keep_a_lens(lenses, values, message, tmp_path):
