@@ -92,7 +92,7 @@ class Registry(Generic[T]):
         if name in self._classes or name in self.names():
             return self._classes[name]
         if isinstance(name, str) and ":" in name:
-            raise UsageError(f"the {self.kind} {name!r}: a file does not load your code; name it as a flag, or in Python")
+            raise UsageError(f"{self.kind} {name!r}: a file does not load your code; name it by flag, .py preset or in Python")
         more = "import the file that registers it first, in Python" if self.kind == "camera model" else "give module:Class"
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or {more}")
 
