@@ -133,7 +133,7 @@ def test_a_stored_configuration_imports_nothing(own):
         {"loss_terms": [{"name": f"{own}:Own"}]},
         {"loss_terms": [{"name": "own_strategy:Own"}]},
     ):
-        with pytest.raises(UsageError, match="a class of your own"):
+        with pytest.raises(UsageError, match="does not load your code"):
             FitConfig.from_json({**plain, **changes})
     assert not own.with_suffix(".ran").exists() and "own_strategy" not in sys.modules
 

@@ -75,11 +75,10 @@ def section(name: str) -> contextlib.AbstractContextManager[None]:
 
 def _age() -> float:
     """Return the time since the start of this process [s]; NaN where the system does not tell."""
-    try:
+    with contextlib.suppress(OSError, ValueError, IndexError, AttributeError):
         ticks = int(Path("/proc/self/stat").read_text("utf-8", "replace").rpartition(")")[2].split()[19])
         return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, ValueError, IndexError, AttributeError):
-        return math.nan
+    return math.nan
 
 
 def since_start(now: Callable[[], float] = time.perf_counter) -> float:

@@ -120,8 +120,7 @@ class Rule:
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"Rule.{name} must be at least 0 and below 1, not {getattr(self, name)}")
         if not 0 < self.alpha_max <= LARGEST_ALPHA:
-            fix = "gradients divide by 1 - alpha; give 0.999"
-            raise UsageError(f"Rule.alpha_max must be in (0, 1) as float32, not {self.alpha_max}: {fix}")
+            raise UsageError(f"Rule.alpha_max must be in (0, 1) as float32, not {self.alpha_max}; give 0.999")
         for name in ("low_pass", "square_sigma"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"Rule.{name} must be a finite number of at least 0, not {getattr(self, name)}")

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, explained
 from warpgs.folders import cache_home, private_folder
 from warpgs.locks import open_to_others
 from warpgs.process import say
@@ -38,10 +38,9 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 def usable_cores() -> int:
     """Return the number of cores that this process may run on, at least 1; all cores if that is unknown."""
-    try:
+    with contextlib.suppress(AttributeError, OSError):
         return len(os.sched_getaffinity(0)) or 1  # missing on macOS and Windows
-    except (AttributeError, OSError):
-        return os.cpu_count() or 1
+    return os.cpu_count() or 1
 
 
 def wake_gpu() -> None:
@@ -259,9 +258,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def no_memory_message(error: BaseException, purpose: str = "") -> str:
     """Return the message for a lack of memory, with remedies."""
-    remedy = (
-        "End other programs, or raise the limits that `ulimit -a` shows; a fit needs less with --memory-limit or --downscale"
-    )
+    remedy = "End other programs, or raise the limits of `ulimit -a`; a fit needs less with --memory-limit or --downscale"
     reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
     return f"out of memory{purpose} ({reason[:200]}). {remedy}, and --resume continues from its last checkpoint"
 
@@ -305,10 +302,8 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
     """Yield each memory group's folder, with the names of its limit file, its use file and a row of its ``memory.stat``."""
     rows = [row.split(":", 2) for row in _text(own).splitlines()]
     paths = {"": "/", "memory": "/"} | {c: p for _, names, p in (r for r in rows if len(r) == 3) for c in names.split(",")}
-    versions = {
-        "": (mount, "memory.max", "memory.current", "inactive_file"),
-        "memory": (mount / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-    }
+    versions = {"": (mount, "memory.max", "memory.current", "inactive_file")}
+    versions["memory"] = mount / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
     for controller, (root, *names) in versions.items():
         parts = PurePosixPath(paths[controller]).parts[1:]
         # a path that leaves the mounted tree is a group that cannot be seen from here
@@ -317,10 +312,9 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
 
 
 def _text(path: Path) -> str:
-    try:
+    with contextlib.suppress(OSError):
         return path.read_text("utf-8", errors="replace")
-    except OSError:
-        return ""
+    return ""
 
 
 def _number(path: Path) -> int | None:
@@ -365,12 +359,11 @@ def choose_kernel_cache(configured: str | None = None) -> tuple[Path, str]:
         folder = home.joinpath(*(("NVIDIA", "warp", "Cache") if sys.platform == "win32" else ("warp",)))
     if folder and not (refused := _fault(folder := folder.resolve())):
         return folder, ""
-    try:
+    none = f"no folder for compiled kernels can be written: {refused}, and none of its own"
+    with explained(none, REMEDY, (ResourceError, OSError), ResourceError):
         own = private_folder() / "kernels"
         own.mkdir(exist_ok=True)
-        return own, refused
-    except (ResourceError, OSError) as e:
-        raise ResourceError(f"no folder for compiled kernels can be written: {refused}, and {e}. {REMEDY}") from e
+    return own, refused
 
 
 def _fault(folder: Path) -> str:

@@ -1,6 +1,7 @@
 """Errors with their exit codes, and the words that help: the nearest name, the documentation of a field."""
 
 import ast
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -9,7 +10,7 @@ import itertools
 import os
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -90,6 +91,20 @@ def expect(condition: object, what: str) -> None:
         raise MalformedError(what)
 
 
+Kinds = type[Exception] | tuple[type[Exception], ...]
+
+
+@contextlib.contextmanager
+def explained(what: str, fix: str, errors: Kinds = OSError, kind: type[WarpgsError] = DataError) -> Iterator[None]:
+    """Turn errors of the block into one that says what is wrong, why in brackets, and the fix."""
+    try:
+        yield
+    except errors as e:
+        why = getattr(e, "strerror", None) or next(iter(str(e).splitlines()), type(e).__name__)
+        at = f"{e.filename}: " if isinstance(e, OSError) and e.filename and str(e.filename) not in what else ""
+        raise kind(f"{what} ({at}{why}); {fix}") from e
+
+
 def listed(names: Sequence[object], most: int = 100) -> str:
     """Return names for a message: all of them, or the first of very many."""
     return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
@@ -108,11 +123,10 @@ def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
 
 def similar_folder(path: Path) -> str:
     """Return `did_you_mean` for the name of a missing folder among the folders beside it."""
-    try:
+    with contextlib.suppress(OSError):  # without the folder around it there is nothing to suggest
         with os.scandir(path.parent) as entries:
             return did_you_mean(path.name, [e.name for e in entries if e.is_dir()])
-    except OSError:  # without the folder around it there is nothing to suggest
-        return ""
+    return ""
 
 
 def install_extras(*names: str) -> str:

@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from warpgs import folders
-from warpgs.errors import DataError, MalformedError, ResourceError, UsageError, expect
+from warpgs.errors import DataError, MalformedError, ResourceError, UsageError, expect, explained
 from warpgs.folders import WINDOWS, Folder, RefusedError, Temporary, is_below, open_folder, output_folder, sweep, temporary_file
 
 # Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its
 # memory.
 #
 # Every untrusted file is opened here. An unreadable file raises an OSError with the reason as its ``strerror``. Callers
-# then raise a `DataError` with the text of `unread_reason` and a remedy, as `read_file` does.
+# then raise a `DataError` with the reason and a remedy, as `read_file` does.
 
 MAX_BYTES = 2**34
 """Default size of the largest file that is read into memory [bytes]."""
@@ -80,10 +80,8 @@ def read_file(
     path: Path, below: Path | None = None, most: int = MAX_BYTES, fix: str = "restore it, or make it again", what: str = ""
 ) -> bytes:
     """Return what `read_input` does, or raise a DataError with a remedy, in which ``what`` names the contents."""
-    try:
+    with explained(f"{path}: {what}cannot be read", fix):
         return read_input(path, most, below)
-    except OSError as e:
-        raise DataError(f"{path}: {what}cannot be read ({unread_reason(e)}); {fix}") from e
 
 
 DTYPES = {
@@ -169,19 +167,15 @@ def tensors_of(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
 def read_tensors(path: Path, fix: str, again: str) -> tuple[dict[str, Any], dict[str, Any], bytes]:
     """Return what `tensors_of` returns, and the file itself; ``again`` is the remedy for a damaged one."""
     data = read_file(path, fix=fix)
-    try:
+    with explained(f"{path}: damaged or not a safetensors file", again, ValueError):
         return *tensors_of(data), data
-    except ValueError as e:
-        raise DataError(f"{path}: damaged or not a safetensors file ({e}); {again}") from e
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:
     """Return the SHA-256 of a regular file, hexadecimal, or raise DataError; ``below`` as in `open_input`."""
-    try:
-        with open_input(path, below) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+    fix = "fix its permissions or copy it again"
+    with explained(f"{path}: cannot be read", fix), open_input(path, below) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def unread_reason(error: Exception) -> str:
@@ -279,8 +273,7 @@ def _sync(folder: Folder) -> None:
             os.fsync(folder.descriptor)
     except OSError as e:
         if e.errno not in NO_FOLDER_SYNC:
-            why = f"the disk does not confirm it ({e.strerror or e})"
-            raise ResourceError(f"{folder.path}: was written, but {why}; check the disk and the last written files") from e
+            raise ResourceError(f"{folder.path}: the disk does not confirm a write ({e.strerror or e}); check the disk") from e
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
@@ -366,10 +359,8 @@ def writing_into(folder: Path) -> Iterator[bool]:
 
 def is_empty(folder: Path) -> bool:
     """Return whether a folder is empty, except for a lock and leftovers of interrupted writes."""
-    try:
+    with explained(f"{folder}: cannot be read", "choose a folder that you may read and write", kind=ResourceError):
         return all(p.name == LOCK or folders.NAMES.fullmatch(p.name) for p in folder.iterdir())
-    except OSError as e:
-        raise ResourceError(f"{folder}: cannot be read ({e.strerror or e}); choose a folder that you may read and write") from e
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -405,7 +396,6 @@ def disk_is_full(folder: Path, said: str) -> bool:
     """Return whether a process failed because the disk of a folder that it wrote into is full."""
     if any(words in said for words in WORDS):
         return True
-    try:
+    with contextlib.suppress(OSError):
         return shutil.disk_usage(folder).free < MIN_FREE
-    except OSError:
-        return False
+    return False

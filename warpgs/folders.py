@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 from filelock import lock_descriptor
 
-from warpgs.errors import ResourceError
+from warpgs.errors import ResourceError, explained
 
 # Folders that this process writes into: the folder that the user names may be a link; below it no link is followed.
 #
@@ -84,8 +84,7 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
         with contextlib.suppress(FileNotFoundError):
             found = self.lstat(name)
             if stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == JUNCTION:
-                why = "is a link, and links inside of a results folder are not followed"
-                raise RefusedError(f"{self.path / name}: {why}; put its target there. The results folder itself may be a link")
+                raise RefusedError(f"{self.path / name}: is a link inside of a results folder; put its target there")
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
         """Open a file, and return its descriptor."""
@@ -363,9 +362,7 @@ def cache_home() -> Path | None:
 def private_folder() -> Path:
     """Return a new folder that only this user can read or write (mode 0700), removed when Python ends; one for each process."""
     stack = contextlib.ExitStack()
-    try:
+    with explained("no temporary folder can be written", "set TMPDIR (TEMP on Windows)", kind=ResourceError):
         made = stack.enter_context(temporary_folder())
-    except OSError as e:
-        raise ResourceError(f"no temporary folder can be written ({e.strerror or e}); set TMPDIR (TEMP on Windows)") from e
     atexit.register(stack.close)
     return made.path

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from warpgs.errors import FolderHeldError, ResourceError, UsageError
+from warpgs.errors import FolderHeldError, ResourceError, UsageError, explained
 from warpgs.files import LOCK, remove_leftovers, writable, writing_into
 from warpgs.folders import LOCKED, Folder, Temporary, cache_home, lock, open_folder, sweep, sweep_temporary_files, unlock
 
@@ -35,12 +35,10 @@ def open_to_others(folder: Path, depth: int = 0) -> Path | None:
         return None  # other users cannot enter it
     for level in range(1, depth + 1):
         for path in folder.glob("/".join("*" * level)):
-            try:
+            with contextlib.suppress(FileNotFoundError):  # another process has put its new file in place
                 found = path.lstat()
-            except FileNotFoundError:  # another process has put its new file in place
-                continue
-            if stat.S_ISLNK(found.st_mode) or _writable_by_others(found, trusted):
-                return path
+                if stat.S_ISLNK(found.st_mode) or _writable_by_others(found, trusted):
+                    return path
     return None
 
 
@@ -138,8 +136,7 @@ def _locked(folder: Folder, name: str, flags: int) -> tuple[int, bool | None]:
         if locked is False:
             os.lseek(descriptor, 1, os.SEEK_SET)
             holder = os.read(descriptor, MOST_BYTES).decode("utf-8", "replace") or "another process"
-            fix = "Wait until that process ends, end it, or choose another folder"
-            raise FolderHeldError(f"{folder.path}: {holder} is writing there. {fix}")
+            raise FolderHeldError(f"{folder.path}: {holder} is writing there. Wait for its end, or choose another folder")
         return descriptor, locked
     except BaseException:
         os.close(descriptor)
@@ -163,17 +160,13 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
         raise UsageError("--engine slurm needs a home folder for its job files; name another folder with --slurm-folder")
     base = (base or home / "warpgs" / "slurm").absolute()
     with contextlib.ExitStack() as stack:
-        try:
+        with explained(f"{base}: not writable", "name another private, shared --slurm-folder", kind=ResourceError):
             base.mkdir(mode=0o700, parents=True, exist_ok=True)
             base = base.resolve()
             if (others := open_to_others(base)) is not None:
-                risk = f"other users can write to {others} and could run code as you"
-                fix = "name a private folder that all nodes see with --slurm-folder"
-                raise UsageError(f"{base}: not safe for Slurm's job files: {risk}; {fix}")
+                raise UsageError(f"{base}: other users can write to {others}; name a private, shared --slurm-folder")
             above = stack.enter_context(open_folder(base))
             sweep(above)
             made = stack.enter_context(Temporary(above))
             above.mkdir(made.name, 0o700)
-        except OSError as e:
-            raise ResourceError(f"{base}: not writable ({e.strerror or e}); name another private, shared --slurm-folder") from e
         yield made.path

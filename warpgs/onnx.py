@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from warpgs.device import usable_cores
-from warpgs.errors import DataError, ResourceError, expect
+from warpgs.errors import DataError, ResourceError, expect, explained
 from warpgs.files import read_file
 
 # Check of an ONNX file by its bytes, before onnxruntime loads it: nothing outside the file may be loaded.
@@ -91,7 +91,7 @@ def _walk(kind: str, message: Message, depth: int = 0) -> Iterator[tuple[str, Me
 
 def check_onnx(data: bytes, path: Path) -> None:
     """Check that bytes are an ONNX model without external data and without custom operators."""
-    try:
+    with explained(f"{path}: not an ONNX model", "export it again, as with `torch.onnx.export`", (ValueError, IndexError)):
         model = _message(memoryview(data))
         graphs = sum(n == MODEL_GRAPH and isinstance(v, memoryview) for n, v in model)
         if graphs != 1 or not any(n == MODEL_OPSET for n, _ in model):
@@ -117,14 +117,10 @@ def check_onnx(data: bytes, path: Path) -> None:
             count += size(part) if kind == "node" else 0
             expect(count <= MAX_NODES, f"more than {MAX_NODES:,} nodes once its functions are inlined")
             if kind == "tensor" and any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in part):
-                weights = f"the weights of {_text(part, TENSOR_NAME) or 'a constant'!r} are in another file, which is not read"
-                fix = "`onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
-                raise DataError(f"{path}: {weights}. Save the model as one file: {fix}")
+                raise DataError(f"{path}: its weights are in another file. Save one file: `onnx.save(onnx.load(FILE), OUT)`")
             if kind == "node" and (domain := _text(part, NODE_DOMAIN)) not in DOMAINS:
                 if (operator := (domain, _text(part, NODE_TYPE))) not in own:
                     raise DataError(f"{path}: {'::'.join(operator)} is not part of ONNX; export with standard operators")
-    except (ValueError, IndexError) as e:
-        raise DataError(f"{path}: not an ONNX model ({e}); give a file written by `torch.onnx.export` or a similar tool") from e
 
 
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
@@ -143,8 +139,7 @@ def read_model(path: Path) -> bytes:
 
 def _first_line(error: Exception) -> str:
     """Return the first line of an error's message, at most 200 letters."""
-    lines = str(error).strip().splitlines()
-    return lines[0][:200] if lines else type(error).__name__
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)[:200]
 
 
 T = TypeVar("T")
@@ -185,8 +180,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Any:
     there = [name for name, long in PROVIDERS.items() if long in ort.get_available_providers()]
     remedy = "`pip uninstall onnxruntime`, then `pip install onnxruntime-gpu[cuda,cudnn]`; or leave the flag out"
     if provider not in there:
-        has = f"this onnxruntime {ort.__version__} has only {', '.join(there)}"
-        raise ResourceError(f"--onnx-provider {provider}: {has}. {remedy}")
+        raise ResourceError(f"--onnx-provider {provider}: this onnxruntime has only {', '.join(there)}. {remedy}")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads or usable_cores()
     options.inter_op_num_threads = 1
@@ -202,8 +196,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Any:
         if provider != "cpu":
             start_session(data, path, "cpu", threads)  # DataError where the file is at fault
             raise ResourceError(f"--onnx-provider {provider}: onnxruntime cannot use it ({_first_line(e)}). {remedy}") from e
-        why = f"onnxruntime {ort.__version__} cannot load it ({_first_line(e)})"
-        raise DataError(f"{path}: {why}; export it again, perhaps with an older operator set") from e
+        raise DataError(f"{path}: onnxruntime cannot load it ({_first_line(e)}); export it again, with older operators") from e
     # onnxruntime continues without a provider if its libraries are missing
     if PROVIDERS[provider] not in session.get_providers():
         raise ResourceError(f"--onnx-provider {provider}: onnxruntime finds no {provider} libraries or device. {remedy}")
@@ -225,11 +218,9 @@ class Model:
         self.path = Path(path)
         data = read_model(self.path)
         self.session, self.sha256 = start_session(data, self.path, provider, threads), hashlib.sha256(data).hexdigest()
-        try:
+        with explained(f"{path}: the name of an input or output is not UTF-8", "export it again", UnicodeDecodeError):
             self.inputs: list[tuple[str, str, list]] = [(i.name, i.type, i.shape) for i in self.session.get_inputs()]
             self.outputs: list[str] = [o.name for o in self.session.get_outputs()]
-        except UnicodeDecodeError as e:
-            raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
 
     @property
     def title(self) -> str:
@@ -242,10 +233,8 @@ class Model:
 
         feed = {name: np.ascontiguousarray(image) for (name, _, _), image in zip(self.inputs, images, strict=True)}
         options = RunOptions()
-        try:
+        refused = f"{self.path}: onnxruntime refuses an input of {' x '.join(map(str, images[0].shape))}"
+        # onnxruntime's errors share no base but Exception
+        with explained(refused, f"describe it in {self.path.name}.json", Exception):
             answer = _interruptible(lambda: self.session.run(names, feed, options), lambda: setattr(options, "terminate", True))
             return [np.asarray(output) for output in answer]
-        except Exception as e:  # onnxruntime's errors share no base but Exception
-            shape = " x ".join(map(str, images[0].shape))
-            fix = f"describe it in {self.path.name}.json"
-            raise DataError(f"{self.path}: onnxruntime refuses an input of {shape} ({_first_line(e)}); {fix}") from e

@@ -1,5 +1,6 @@
 """Parts that plug in: classes found by name, built-in or a user's own."""
 
+import contextlib
 import functools
 import hashlib
 import importlib
@@ -81,11 +82,8 @@ class Registry(Generic[T]):
 
     def unnamed(self, cls: type) -> str:
         """Return the message on a class that is not registered by its ``name``; its file may have been loaded twice."""
-        return (
-            f"the {self.kind} {cls.__qualname__} has no registered name; register it with "
-            f'@warpgs.{_FACES.get(self.kind, "train")}.register_{self.kind.replace(" ", "_")}("name") above the class, '
-            "or name it as module:Class, in one way everywhere"
-        )
+        how = f'@warpgs.{_FACES.get(self.kind, "train")}.register_{self.kind.replace(" ", "_")}("name")'
+        return f"the {self.kind} {cls.__qualname__} has no registered name; write {how} above it, or name it as module:Class"
 
     def find(self, name: str | type[T]) -> type[T]:
         """Return the class of a name, or the class itself."""
@@ -94,9 +92,7 @@ class Registry(Generic[T]):
         if name in self._classes or name in self.names():
             return self._classes[name]
         if isinstance(name, str) and ":" in name:
-            why = "a class of your own. The file of a preset or run does not load your code"
-            fix = "name the class on the command line or in a preset that is a .py file, or pass it in Python"
-            raise UsageError(f"the {self.kind} {name!r} is {why}: {fix}")
+            raise UsageError(f"{self.kind} {name!r}: a file does not load your code; name it by flag, .py preset or in Python")
         more = "import the file that registers it first, in Python" if self.kind == "camera model" else "give module:Class"
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or {more}")
 
@@ -169,10 +165,9 @@ def own_places(classes: Iterable[type]) -> list[str]:
 def module_digest(module: ModuleType | None) -> str:
     """Return the SHA-256 of the file of a module, read at the first call because it may be edited later; empty without one."""
     path = getattr(module, "__file__", None)
-    try:
+    with contextlib.suppress(DataError):  # a module of an archive, or one that is gone since
         return input_digest(path) if path else ""
-    except DataError:  # a module of an archive, or one that is gone since
-        return ""
+    return ""
 
 
 def is_ours(cls: type) -> bool:

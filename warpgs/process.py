@@ -466,12 +466,11 @@ class PythonWorker:
     def send(self, line: str) -> bool:
         """Send a line; return False where the process has ended."""
         assert self._process.stdin is not None
-        try:
+        with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(f"{line}\n")
             self._process.stdin.flush()
-        except (OSError, ValueError):
-            return False
-        return True
+            return True
+        return False
 
     def lines(self) -> Iterator[str]:
         """Yield the lines that the process answers, until the process ends."""

@@ -18,7 +18,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, explained
 from warpgs.process import ignored_signals, say
 
 if TYPE_CHECKING:
@@ -180,10 +180,9 @@ is detected directly."""
 
 def machine() -> str:
     """Return a name of the machine and of its process table; process numbers are valid only within one table."""
-    try:
+    with contextlib.suppress(OSError):  # a system other than Linux
         return f"{Path('/proc/sys/kernel/random/boot_id').read_text().strip()} {os.stat('/proc/self/ns/pid').st_ino}"
-    except OSError:  # a system other than Linux
-        return platform.node()
+    return platform.node()
 
 
 def is_gone(process: int) -> bool:
@@ -223,9 +222,7 @@ class RankWatch:
         until = time.monotonic() + seconds
         while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
             if time.monotonic() > until:
-                there = f"only {self.count - len(missing)} of {self.count} ranks connected within {seconds:.0f} s"
-                fix = "Start all ranks with the same MASTER_ADDR and MASTER_PORT"
-                raise ResourceError(f"{there}; rank {missing[0]} is missing. {fix}")
+                raise ResourceError(f"rank {missing[0]} did not connect; start all with one MASTER_ADDR and MASTER_PORT")
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
@@ -271,8 +268,9 @@ class RankWatch:
         self.leaving.set()
         try:
             first, gone = self.store.add("spoke", 1) == 1, False
-        except RuntimeError:  # the store is gone: no other process can be asked
-            first = gone = self._is_lowest_here()
+        except RuntimeError:  # the store is gone: no other process can be asked; the lowest rank left on this machine speaks
+            below = (self._seen[r][0].split("|", 2) for r in range(self.rank) if r in self._seen)
+            first = gone = all(there != self.here or is_gone(int(process)) for _, process, there in below)
         if first:
             say(line, error=True)
         if gone and self.rank != 0:
@@ -283,11 +281,6 @@ class RankWatch:
         """On rank 0, give the other ranks time to read that the fit ends, since the store may end with this process."""
         if self.rank == 0:
             time.sleep(3 * BEAT_SECONDS)
-
-    def _is_lowest_here(self) -> bool:
-        """Return whether no rank below this one still runs on this machine."""
-        below = (self._seen[r][0].split("|", 2) for r in range(self.rank) if r in self._seen)
-        return all(there != self.here or is_gone(int(process)) for _, process, there in below)
 
     def leave(self) -> None:
         """Tell the other ranks that this process ends normally; all ranks but the first wait for the first to end."""
@@ -412,8 +405,7 @@ class Group(Ranks):
 def _number(name: str, least: int, most: int, default: str | None = None) -> int:
     text = os.environ.get(name, default)
     if text is None or not text.isdecimal() or not least <= int(text) <= most:
-        fix = "start the fit with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
-        raise UsageError(f"the environment variable {name} must be a whole number from {least} to {most}, not {text!r}; {fix}")
+        raise UsageError(f"the variable {name} must be a whole number from {least} to {most}, not {text!r}; use torchrun")
     return int(text)
 
 
@@ -447,25 +439,19 @@ def join(device: str) -> Ranks:
     agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # torchrun itself holds the store then
     cuda = device != "cpu" and (device.startswith("cuda") or torch.cuda.is_available())
     home = _stay_home(address)
-    try:
+    with explained(f"rank {rank} of {count} cannot reach {address}:{port}", "start them all", RuntimeError, kind=ResourceError):
         store = _store(address, port, count, home, hosts=rank == 0 and not agent)
         watch = RankWatch(rank, count, store, _store(address, port, count, home, hosts=False))
-    except RuntimeError as e:
-        raise ResourceError(f"rank {rank} of {count} cannot reach {address}:{port} ({str(e).splitlines()[0][:200]})") from e
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
     if cuda:
         if torch.cuda.device_count() <= local:
-            found = f"torch finds {torch.cuda.device_count()} GPUs, and NCCL needs one for each process"
-            fix = "Start fewer processes, or give --device cpu"
-            raise ResourceError(f"rank {rank} needs GPU {local} of this machine, but {found}. {fix}")
+            raise ResourceError(f"rank {rank} needs GPU {local}, which is missing. Start fewer processes, or give --device cpu")
         torch.cuda.set_device(local)
     watch.meet(JOIN_SECONDS)
-    try:
+    with explained(f"{backend} cannot connect the {count} ranks", "start them again", RuntimeError, kind=ResourceError):
         group = dist.PrefixStore("group", store)
         dist.init_process_group(backend, store=group, rank=rank, world_size=count, timeout=EXCHANGE_TIME)
-    except RuntimeError as e:
-        raise ResourceError(f"{backend} cannot connect the {count} ranks ({str(e).splitlines()[0][:200]})") from e
     if rank == 0:
         torchrun = [("torchrun", *at) for at in listening_at(os.getppid()) if agent and at[1] == port]
         say_what_is_open([*(("rank 0", *at) for at in listening_at()), *torchrun])

@@ -527,8 +527,7 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
 def checked_views(views: Iterable[View], where: str = "") -> list[View]:
     """Return views whose fields are all valid, in their order."""
     if isinstance(views, (View, Scene, np.ndarray)) or not isinstance(views, Iterable):
-        fix = "give scene.views" if isinstance(views, Scene) else "give [view]"
-        raise _wrong(f"{where}views", "a list of View", type(views).__name__, fix)
+        raise _wrong(f"{where}views", "a list of View", type(views).__name__, "give [view], or scene.views")
     with ThreadPoolExecutor() as pool:  # an error is that of the first view that has one
         return list(pool.map(lambda row: _checked_view(f"{where}views[{row[0]}]", row[1], where), enumerate(views)))
 
@@ -550,8 +549,7 @@ def _checked_view(what: str, view: View, where: str) -> View:
     if depth is not None:
         _check(f"{of}depth", depth, GivenDepth, "give GivenDepth(depth)")
         if not isinstance(depth.kind, str) or depth.kind not in DEPTH_KINDS:
-            fix = f"give {', '.join(DEPTH_KINDS[:-1])} or {DEPTH_KINDS[-1]}"
-            raise _wrong(f"{of}depth.kind", "the meaning of the values", repr(depth.kind), fix)
+            raise _wrong(f"{of}depth.kind", "the meaning of the values", repr(depth.kind), f"give {', '.join(DEPTH_KINDS)}")
         sure = depth.confidence
         sure = None if sure is None else _numbers(f"{of}depth.confidence", sure, size)
         depth = _with(depth, values=_numbers(f"{of}depth.values", depth.values, size, high=MOST), confidence=sure)
@@ -617,15 +615,14 @@ def _checked_normals(what: str, value: Any, camera: Camera) -> np.ndarray:
     normals = _numbers(what, value, (camera.height, camera.width, 3), low=-1)
     squares = np.einsum("...i,...i", normals, normals)
     if squares.max() > (1 + 10 * SLACK) ** 2:
-        fix = "divide normals by their length; decode colours first, 2 * normals - 1"
-        raise _wrong(what, "unit vectors, or 0 where missing", f"a length of {math.sqrt(squares.max()):.4g}", fix)
+        length = f"a length of {math.sqrt(squares.max()):.4g}"
+        raise _wrong(what, "unit vectors, or 0 where missing", length, "divide them by their length; decode colours first")
     if camera.model == "pinhole":
         K, x, y = camera.K, np.arange(0, camera.width, 4) + 0.5, np.arange(0, camera.height, 4)[:, None] + 0.5
         part = normals[::4, ::4]  # enough for a fraction of the pixels
         along = part[..., 0] * ((x - K[0, 2]) / K[0, 0]) + part[..., 1] * ((y - K[1, 2]) / K[1, 1]) + part[..., 2]
         if np.count_nonzero(along > 0) > 0.5 * np.count_nonzero(squares[::4, ::4]):
-            fix = "for OpenGL axes, give normals * np.float32([1, -1, -1])"
-            raise _wrong(what, "turned towards the camera, in OpenCV axes", "most of them facing away", fix)
+            raise _wrong(what, "turned towards the camera", "most facing away", "give normals * np.float32([1, -1, -1])")
     return normals
 
 
@@ -677,7 +674,8 @@ def _plain(what: str, value: Any, shape: tuple[int, ...], needs: str, cast: str,
     if not isinstance(value, np.ndarray):
         raise _wrong(what, needs, type(value).__name__, "give an array" if value is None else f"give {cast}")
     if value.shape != shape:
-        raise _wrong(what, needs, f"shape {list(value.shape)}", fix or _shape_fix(noun, value.shape, shape))
+        fix = fix or f"put channels last, without further axes, or resize it to the camera's {shape[1]} x {shape[0]} px"
+        raise _wrong(what, needs, f"shape {list(value.shape)}", fix)
     return value
 
 
@@ -702,31 +700,9 @@ def _with(record: Record, **fields: Any) -> Record:
 def _value_fix(noun: str, real: bool, least: float, most: float, low: float, high: float) -> str:
     """Return the fix for an array of another type, or with values from ``least`` to ``most`` outside of [low, high]."""
     if not math.isfinite(least + most):
-        replaced = f"replace NaN and infinity: np.nan_to_num({noun}, posinf=0, neginf=0)"
-        return "estimate it again, or remove what is not finite" if high == math.inf else replaced
-    if not real and low == -1:
-        return f"decode colours: {noun} / np.float32(127.5) - 1"
-    if not real and high == MOST:
-        return f"give {noun} * np.float32(unit); unit is 0.001 for millimetres if cameras are in metres"
-    if high == 1 and least >= low and most > (16 if real else 1):
-        full = 255 if most <= 256 else 65535
-        return f"divide by its full scale, such as {full}" if real else f"divide by {full}: {noun}.astype(np.float32) / {full}"
+        return f"estimate it again, or replace what is not finite: np.nan_to_num({noun}, posinf=0, neginf=0)"
+    if high == 1 and most > (16 if real else 1):
+        return f"divide by its full scale: {noun}.astype(np.float32) / {255 if most <= 256 else 65535}"
     if not real:
-        return f"give {noun}.astype(np.float{64 if high == math.inf else 32})"
-    if low == 0 and high == 1 and least < -0.1:
-        return f"undo its normalisation, such as ({noun} + 1) / 2 for [-1, 1]"
+        return f"give floats: {noun}.astype(np.float32), in the unit of the cameras, or decoded from colours"
     return f"set missing values to 0: np.maximum({noun}, 0)" if high == MOST else f"clip it: np.clip({noun}, {low:g}, {high:g})"
-
-
-def _shape_fix(noun: str, found: tuple[int, ...], shape: tuple[int, ...]) -> str:
-    """Return the fix for an array of another shape than the camera's [H, W] or [H, W, 3]."""
-    size, color = shape[:2], len(shape) == 3
-    if found[:2] == size and len(found) == 3:
-        return f"give {noun}[..., :3], and opacity as alpha" if color and found[2] > 3 else f"keep one channel: {noun}[..., 0]"
-    if color and found in (size, (1, *size)):
-        return f"repeat the gray: np.repeat({noun}.reshape({size[0]}, {size[1]}, 1), 3, -1)"
-    if found[1:3] == size:
-        return f"give {noun}[0]" if found[0] == 1 else f"put channels last: np.moveaxis({noun}, 0, -1)"
-    if found[:2] == size[::-1]:
-        return f"transpose it, np.swapaxes({noun}, 0, 1), or swap camera.width and camera.height"
-    return f"resize it to the camera's {size[1]} x {size[0]} px, or scale width, height and K of the camera to the image"

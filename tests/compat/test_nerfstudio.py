@@ -199,7 +199,7 @@ def test_the_training_set_is_read_whole(plugin, demo):
 
 def test_what_has_no_effect_is_refused(plugin, tmp_path):
     """A setting of splatfacto's training, and a checkpoint to continue from."""
-    with pytest.raises(warpgs.UsageError, match=r"--pipeline\.model\.warmup-length: .*preset FILE\.toml"):
+    with pytest.raises(warpgs.UsageError, match=r"--pipeline\.model\.warmup-length .*preset FILE\.toml"):
         plugin.WarpgsModel(plugin.WarpgsModelConfig(warmup_length=1))
     trainer = plugin.WarpgsTrainer(plugin.WarpgsTrainerConfig(), None, None, tmp_path)
     trainer._start_step = 100

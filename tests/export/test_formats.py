@@ -82,7 +82,7 @@ def test_degree_4_is_refused_where_a_format_lacks_it(tmp_path):
     made = model(n=5, degree=4)
     for suffix in (".compressed.ply", ".sog", ".glb", ".gltf"):
         path = tmp_path / f"a{suffix}"
-        with pytest.raises(DataError, match=r"up to degree 3, not 4\. Drop .*--sh-degree 3.*sh\[:, :16\], or write \.ply"):
+        with pytest.raises(DataError, match=r"degree 4 is too high; give --sh-degree 3, or \.ply"):
             write_gaussians(path, made, units="file")
         assert not path.exists()
     for suffix, count in ((".ply", 25), (".spz", 25), (".splat", 1)):

@@ -140,7 +140,7 @@ def test_a_factor_and_a_longest_side_scale_each_axis_of_the_camera(downscale, si
     )
     assert any("17 px on the longer side; change it with --max-side" in d for d in loaded.done) == (side == 17)
     for wrong, flag in (({"max_side": 4}, "--max-side 4 leaves 4 x 3"), ({"downscale": 9}, "--downscale 9 leaves 4 x 3")):
-        with pytest.raises(UsageError, match=rf"{flag} px of .*a\.png.*Choose a smaller factor"):
+        with pytest.raises(UsageError, match=rf"{flag} px of .*a\.png.*keep at least 4 px of both"):
             load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(**wrong))
 
 
@@ -213,7 +213,7 @@ def test_masks_by_the_names_of_other_programs(name, tmp_path):
     scene = load_scene(tmp_path)
     assert [v.name for v in scene.views if v.mask is not None and not v.mask.all()] == ["face_mask.png"]
     assert [n for n in scene.notes if "masks" in n and "match" in n] == [
-        "2 of 5 files in masks match no image or several, such as c.tif; name a mask like its image: c.png or c.png.png"
+        "2 of 5 files in masks, such as c.tif, match no image or several; name a mask like its image: c.png"
     ]
 
 
@@ -334,11 +334,11 @@ def test_masks_that_cannot_be_used(tmp_path):
     path = tmp_path / "masks" / "photo0.png"
     for i in range(scenes.VIEWS):
         scenes.save(path.with_name(f"photo{i}.png"), np.zeros((12, 16), np.uint8))
-    scenes.refused(tmp_path, r"has 0 usable views \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
+    scenes.refused(tmp_path, r"has 0 usable views, not at least 2 \(.*masks that keep no pixel.*--mask-keeps.*photo0.png")
     for i in range(1, scenes.VIEWS):
         path.with_name(f"photo{i}.png").unlink()
     scenes.save(path, np.full((12, 30), 255, np.uint8))
-    scenes.refused(tmp_path, r"photo0.png: its mask is 30 x 12 px, the image 16 x 12")
+    scenes.refused(tmp_path, r"photo0.png: its mask is 30 x 12 px, of another aspect")
     path.write_bytes(b"no image")
     scenes.refused(tmp_path, r"masks/photo0.png: the image cannot be decoded")
     scenes.save(path, np.full((24, 32), 255, np.uint8))  # twice the size is the same mask
@@ -504,7 +504,7 @@ def announcing(kind: str, width: int, height: int) -> bytes:
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "BMP", "WEBP"])
 def test_the_header_alone_decides_what_is_too_large(kind, tmp_path):
     width, height = (30000, 30000) if kind != "WEBP" else (16000, 16000)
-    limit = rf"more than the limit of 100,000,000 .*--max-pixels {width * height} .decoding"
+    limit = rf"more than the limit of 100,000,000 .*--max-pixels {width * height}"
     refused(tmp_path, announcing(kind, width, height), f"is {width} x {height} px, {limit}")
     refused(tmp_path, announcing(kind, 0, 64), "decoded")
 
@@ -571,9 +571,7 @@ def test_no_memory_for_an_image_is_no_damage(tmp_path, monkeypatch):
 
     for owner, name, wrong in ((cv2, "imdecode", full), (ImageFile.ImageFile, "load", lambda *_: np.empty(2**50))):
         monkeypatch.setattr(owner, name, wrong)
-        with pytest.raises(
-            ResourceError, match=r"photo.img: decoding the image needs 0.0 GiB of free memory; shrink the image"
-        ):
+        with pytest.raises(ResourceError, match=r"photo.img: decoding the image needs 0.0 GiB; shrink it"):
             decode(tmp_path / "photo.img")
 
 

@@ -72,7 +72,7 @@ def test_truncations_and_wrong_counts_are_noticed(name, tmp_path):
             read_all(tmp_path, "bin")
     (right,) = struct.unpack_from("<Q", files[name])
     for count, words in (
-        *((c, rf"announces {c:,} records and holds at most \d+: truncated") for c in (100, 2**40, 2**64 - 1)),
+        *((c, rf"truncated: {c:,} records announced, at most") for c in (100, 2**40, 2**64 - 1)),
         (right - 1, r"\d+ bytes follow the last of its records. Copy"),
     ):
         scenes.write_files(tmp_path, files | {name: struct.pack("<Q", count) + files[name][8:]})
@@ -90,7 +90,7 @@ def test_lens_models_distortion_and_points_of_binary_files(tmp_path):
     cameras, path = (tmp_path / "sparse" / "0" / f"{name}.bin" for name in ("cameras", "points3D"))
     for model, name in ((5, "OPENCV_FISHEYE"), (77, "77"), (-1, "-1")):
         cameras.write_bytes(cameras.read_bytes()[:12] + struct.pack("<i", model) + cameras.read_bytes()[16:])
-        refused(tmp_path, rf"cameras.bin: camera model {name} is not supported \(supported: SIMPLE_PINHOLE.*image_undistorter")
+        refused(tmp_path, rf"cameras.bin: camera model {name} is not supported. Run `colmap image_undistorter")
     scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 1e300))
     refused(tmp_path, r"camera 1: distortion .*1e\+300")
     for k1 in (1e-320, 5e-324, -1e-320, 1e-100):
@@ -99,7 +99,7 @@ def test_lens_models_distortion_and_points_of_binary_files(tmp_path):
         np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)
     for far in (1.7e308, -1.7e308, 1e30):
         path.write_bytes(path.read_bytes()[:16] + struct.pack("<d", far) + path.read_bytes()[24:])
-        refused(tmp_path, r"1 of 3 points are not finite, or farther than 1e\+12 times the extent of the cameras; remove them")
+        refused(tmp_path, r"1 of 3 points are not finite, or too far from the cameras; remove them")
     path.write_bytes(struct.pack("<Q", 0))
     scene = load_scene(tmp_path)
     assert len(scene.points) == 0 and "points3D.bin holds no points" in scene.notes
@@ -151,7 +151,7 @@ def patched_pose(tmp_path, **changes):
         ({"_2": "x"}, r"images.txt, line 4: cannot be understood \(could not convert"),
         ({"_8": "9"}, r"'photo1.png': camera 9 is missing from cameras.txt"),
         ({"_0": "1"}, r"images.txt, line 4: id 1 is given twice"),
-        ({"_5": "1e100"}, r"image 'photo1.png': its camera centre .* is beyond 1e\+12 units"),
+        ({"_5": "1e100"}, r"image 'photo1.png': its centre is beyond 1e\+12 units"),
         ({"_9": "photo0.png"}, r"the image 'photo0.png' is listed twice"),
         ({"_9": "../images.png"}, r"'../images.png' points outside the scene folder"),
         ({"_9": "/etc/passwd"}, r"'/etc/passwd' points outside the scene folder"),
@@ -187,7 +187,7 @@ def test_images_without_a_finite_pose_or_camera_are_left_out(number, what, kind,
         cameras.write_bytes(struct.pack("<Q", 2) + cameras.read_bytes()[8:] + struct.pack("<iiQQ4d", 2, 1, 16, 12, *lens))
     scene = load_scene(tmp_path)
     assert [v.name for v in scene.views] == [n for n in scenes.NAMES if n != "photo2.png"]
-    note = f"left out: 1 of 5 images of images.{kind} have a pose or camera that is not finite: photo2.png"
+    note = "left out: 1 of 5 images, as pose or camera is not finite: photo2.png"
     assert note in scene.notes and len(scene.points) == 3 and not any("have no pose" in n for n in scene.notes)
     assert (len((read := read_cameras(folder))[0]), read[1]) == (4, [note])
     refused(tmp_path, "the pose is not finite" if what == "pose" else r"camera 2: focal lengths \[(nan|inf)", strict=True)
@@ -228,7 +228,7 @@ def test_points_that_are_not_finite_are_left_out(kind, tmp_path):
         ("cameras.txt", b"\xff\xfe", r"cameras.txt, line 1: cannot be understood"),
         ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n2 1 0 0 0 0 0 3 1 photo1.png\n", r"images.txt, line 2: expected"),
         ("images.txt", "", r"has 0 usable views.*at least 2"),
-        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n\n", r"has 1 usable view.*at least 2. Add images"),
+        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n\n", r"has 1 usable views.*at least 2 .*. Add images"),
     ],
 )
 def test_broken_text_files(name, content, message, tmp_path):
@@ -295,15 +295,18 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
         ({"mask_path": "m.png"}, r"frame 1 .*: its mask .*m.png is missing; restore it, or remove mask_path"),
         ({"file_path": "images/photo0.png"}, r"the image 'images/photo0.png' is listed twice"),
         ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be over 0."),
-        ({"fl_x": True}, r"frame 1 .*: fl_x must be a finite number, not True"),
-        ({"fl_x": 10**400}, r"frame 1 .*: fl_x must be a finite number"),
-        ({"cx": "8"}, r"frame 1 .*: cx must be a finite number, not '8'; write it .* without quotes"),
-        *(({"fl_x": n}, rf"frame 1 .*: fl_x must be a finite number, not {n}") for n in (np.nan, np.inf, -np.inf)),
+        ({"fl_x": True}, r"frame 1 .*: not a number .fl_x must be a finite number, not True"),
+        ({"fl_x": 10**400}, r"frame 1 .*: not a number .fl_x must be a finite number"),
+        ({"cx": "8"}, r"frame 1 .*: not a number .cx must be a finite number, not '8'.; write it without quotes"),
+        *(
+            ({"fl_x": n}, rf"frame 1 .*: not a number .fl_x must be a finite number, not {n}")
+            for n in (np.nan, np.inf, -np.inf)
+        ),
         ({"transform_matrix": [[np.nan] * 4] * 4}, r"frame 1 .*: the pose is not finite"),
         ({"w": 0}, r"frame 1 .*: the camera's image size 0 x 12 px is impossible"),
         ({"w": 30}, r"photo1.png: the image is 16 x 12 px, its camera 30 x 12"),
-        ({"k4": 0.1}, r"frame 1 .*: k4 belongs to a fisheye"),
-        ({"k4": 0.1, "camera_model": "FULL_OPENCV"}, r"frame 1 .*: k4 belongs to a fisheye or rational lens"),
+        ({"k4": 0.1}, r"frame 1 .*: k4 is not supported"),
+        ({"k4": 0.1, "camera_model": "FULL_OPENCV"}, r"frame 1 .*: k4 is not supported"),
         ({"camera_model": "OPENCV_FISHEYE"}, r"frame 1 .*: camera model OPENCV_FISHEYE is not supported"),
     ],
 )
@@ -396,7 +399,7 @@ def test_numpy_files_that_are_none(name, write, tmp_path):
             f.write(b"\0" * 64)
         else:
             f.truncate(2**24 + 1)  # of which zipfile would make ten times its size of a table of contents
-    refused(tmp_path, rf"{name}: cannot be read as (a numpy array|an archive of arrays \(OSError: .*is larger than 16 MiB)")
+    refused(tmp_path, rf"{name}: cannot be read as (a numpy array|an archive of arrays \(is larger than 16 MiB)")
     if name.endswith("npy"):
         with (tmp_path / name).open("wb") as f:
             np.savez(f, a=np.zeros(3))
@@ -489,7 +492,7 @@ def test_metashape_files(change, message, tmp_path):
 @pytest.mark.parametrize(
     "old,new,message",
     [
-        (",0,0,0,0,0,0,0,0", ",0,0,0,0,0,0.1,0,0", "line 3: k4 is not supported; align with the distortion model Brown3"),
+        (",0,0,0,0,0,0,0,0", ",0,0,0,0,0,0.1,0,0", "line 3: k4 is not supported; align with the model Brown3"),
         (
             "0,0,0,0,0,0,0,0",
             "0,0,0",

@@ -64,16 +64,14 @@ def at_corner(array: np.ndarray, value: float) -> np.ndarray:
 B = "view 'b.png': "
 IN_VIEWS = {
     "image uint8": (changed("view", image=(255 * PIXELS).astype(np.uint8)), "image", "image.astype(np.float32) / 255"),
-    "image uint16": (changed("view", image=(65535 * PIXELS).astype(np.uint16)), "image", "divide by 65535"),
-    "image 0..255": (changed("view", image=255 * PIXELS), "image", "such as 255"),
-    "image in [-1, 1]": (changed("view", image=2 * PIXELS - 1), "image", "(image + 1) / 2"),
+    "image uint16": (changed("view", image=(65535 * PIXELS).astype(np.uint16)), "image", "/ 65535"),
+    "image 0..255": (changed("view", image=255 * PIXELS), "image", "/ 255"),
     "image overshoots": (changed("view", image=1.2 * PIXELS), "image", "np.clip(image, 0, 1)"),
     "image with infinity": (changed("view", image=at_corner(PIXELS, np.inf)), "image", "np.nan_to_num(image"),
-    "image of 4 channels": (changed("view", image=np.ones((H, W, 4), np.float32)), "image", "image[..., :3]"),
-    "image channels first": (changed("view", image=np.moveaxis(PIXELS, -1, 0)), "image", "np.moveaxis(image, 0, -1)"),
-    "image gray": (changed("view", image=FLAT), "image", f"np.repeat(image.reshape({H}, {W}, 1), 3, -1)"),
-    "image batch": (changed("view", image=PIXELS[None]), "image", "give image[0]"),
-    "image transposed": (changed("view", image=PIXELS.swapaxes(0, 1)), "image", "np.swapaxes(image, 0, 1)"),
+    "image of 4 channels": (changed("view", image=np.ones((H, W, 4), np.float32)), "image", "put channels last"),
+    "image channels first": (changed("view", image=np.moveaxis(PIXELS, -1, 0)), "image", "put channels last"),
+    "image gray": (changed("view", image=FLAT), "image", "put channels last"),
+    "image batch": (changed("view", image=PIXELS[None]), "image", "without further axes"),
     "image of another size": (changed("view", image=PIXELS[:-2]), "image", f"resize it to the camera's {W} x {H} px"),
     "image bfloat16": (changed("view", image=torch.from_numpy(PIXELS).bfloat16()), "image", ".float()"),
     "image masked": (changed("view", image=np.ma.masked_array(PIXELS)), "image", "image.data, and its mask as View.mask"),
@@ -83,12 +81,12 @@ IN_VIEWS = {
     "mask empty": (changed("view", mask=~MASK & MASK), "mask", "give ~mask if it is inverted"),
     "alpha_estimated a map": (changed("view", alpha_estimated=FLAT), "alpha_estimated", "give True or False"),
     "depth an array": (changed("view", depth=FLAT), "depth", "give GivenDepth(depth)"),
-    "depth in millimetres": (changed("depth", values=(1000 * FLAT).astype(np.uint16)), "depth.values", "np.float32(unit)"),
+    "depth in millimetres": (changed("depth", values=(1000 * FLAT).astype(np.uint16)), "depth.values", "in the unit"),
     "depth negative": (changed("depth", values=-FLAT), "depth.values", "np.maximum(depth.values, 0)"),
-    "depth kind": (changed("depth", kind="inverse"), "depth.kind", "give metric, relative or disparity"),
-    "normals as colours": (changed("view", normals=np.full((H, W, 3), 0.9, np.float32)), "normals", "2 * normals - 1"),
+    "depth kind": (changed("depth", kind="inverse"), "depth.kind", "give metric, relative, disparity"),
+    "normals as colours": (changed("view", normals=np.full((H, W, 3), 0.9, np.float32)), "normals", "decode colours first"),
     "normals in OpenGL axes": (changed("view", normals=-FACING), "normals", "np.float32([1, -1, -1])"),
-    "normals uint8": (changed("view", normals=np.zeros((H, W, 3), np.uint8)), "normals", "normals / np.float32(127.5) - 1"),
+    "normals uint8": (changed("view", normals=np.zeros((H, W, 3), np.uint8)), "normals", "give floats"),
     "camera None": (changed("view", camera=None), "camera", "Camera(viewmat, K, width, height)"),
     "width a float": (changed("camera", width=20.0), "camera.width", "give int(width)"),
     "height 0": (changed("camera", height=0), "camera.height", "at least 1"),
@@ -181,7 +179,7 @@ def test_a_right_scene_passes_and_arguments_that_are_none_are_named():
     scene = dataclasses.replace(scene, views=views, background=(1, 1, 1))
     assert checked_scene(scene) is scene and all(map(lambda a, b: a is b, checked_views(views), views))
     scene = right()
-    for views, fix in ((scene, "give scene.views"), (scene.views[0], r"give \[view\]"), (PIXELS, r"give \[view\]")):
+    for views, fix in ((scene, "or scene.views"), (scene.views[0], r"give \[view\]"), (PIXELS, r"give \[view\]")):
         with pytest.raises(DataError, match=f"views must be a list of View; got .*{fix}"):
             warpgs.evaluate(three_gaussians(), views)
     assert warpgs.evaluate(three_gaussians(), []) == []
@@ -225,14 +223,14 @@ def test_other_arrays_of_the_same_values_score_and_fit_the_same(convert):
 
 DOUBTS = {
     "lens": (r"leaves few", r"leaves few pixels of 5 images, \d+% of images/photo"),
-    "principal point": ("principal point", r"principal point of 5 of 5 views is outside the image, .*: 40, 6 of 16 x 12 px"),
+    "principal point": ("principal point", r"principal points of 5 views, as of .*photo0.png, are outside the image"),
     "size": ("size of their camera", r"5 images of 0.25 times the size of their camera"),
-    "rotation": ("all cameras", r"all cameras are within .* units of one place: pure rotation"),
+    "rotation": ("all cameras", r"all cameras are within .* units of one place, without depth"),
     "binary masks": ("0 and 1", r"1 image with a mask of the values 0 and 1, read as 0 and 255"),
     "empty mask": ("keep no", r"masks that keep no pixel, so that their views are left out .*--mask-keeps.*photo1.png \(1\)"),
     "equal": ("equal pixels", r"2 of 5 photographs have equal pixels, as .*photo0.png and .*photo1.png"),
     "blank": ("single colour", r"1 of 5 photographs have a single colour, such as .*photo1.png; --exclude them"),
-    "focal length": ("focal length", r"focal length of 5 of 5 views is over 100 times .*photo0.png: 2000 px at 16 x 12"),
+    "focal length": ("focal length", r"focal lengths of 5 views, as of .*photo0.png, are over 100 sides"),
     "one other pixel": ("no such words", ""),
     "none": ("no such words", ""),
 }

@@ -336,7 +336,7 @@ def test_tensors_without_kernels_or_memory_are_refused_by_name():
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         with pytest.raises(ValueError, match="means is a fake tensor, without memory"):
             rasterize(Gaussians(**{n: mode.from_tensor(t) for n, t in g.tensors().items()}), cam)
-        with pytest.raises(TypeError, match="not a FakeTensor without memory"):  # under their mode every new tensor is one
+        with pytest.raises(ValueError, match="background is a fake tensor"):  # under their mode every new tensor is one
             rasterize(g, cam)
 
 
@@ -404,7 +404,7 @@ def test_check_names_what_disagrees():
         launch.check(a=(a.int(), "N 3"))
     with pytest.raises(TypeError, match=r"b is torch\.float64 but a is torch\.float32"):
         launch.check(a=(a, "N 3"), b=(b.double(), "K N"))
-    with pytest.raises(ValueError, match="b is on meta but a is on cpu"):
+    with pytest.raises(ValueError, match="b is on meta, but the kernels run"):
         launch.check(a=(a, "N 3"), b=(b.to("meta"), "K N"))
     for pattern in ("N", "N 3 1", "N 4", "N N", "3 3"):
         with pytest.raises(ValueError, match=r"a must have shape .* not \[2, 3\]"):

@@ -118,7 +118,7 @@ def test_empty_and_bad_input():
             run(broken, cam)
     with pytest.raises(TypeError, match=r"log_scales is torch\.float64"):
         run(Gaussians(**{**gaussians.tensors(), "log_scales": gaussians.log_scales.double()}), cam)
-    with pytest.raises(ValueError, match="degree 3 needs 16"):
+    with pytest.raises(ValueError, match="the degree needs 16"):
         run(gaussians, cam, degree=3)
     one = camera(1, 1, cameras=1, dtype=torch.float32)
     assert run(gaussians, one, SMOOTH)[0].shape == (1, 4, 12)

@@ -217,9 +217,7 @@ def test_a_reconstruction_deep_in_the_photographs_is_named(tmp_path, photographs
     (folder / "run" / "scene" / "poses.json").touch()
     assert not list(models_below(folder))
     scenes.write_files(folder / "out" / "my model", scenes.colmap_txt())
-    with pytest.raises(
-        UsageError, match=r"holds a COLMAP reconstruction in out/my model: `warpgs fit .* --reconstruction out/my"
-    ):
+    with pytest.raises(UsageError, match=r"holds poses: use `warpgs fit .* --reconstruction out/my"):
         find_poses(folder, tmp_path / "out")
     request = SceneRequest(path=str(folder), reconstruction="out/my model")
     assert with_poses(request, None, print) == (request, [])
@@ -414,7 +412,7 @@ def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, 
     view = found_mapping().views[0]
     found = found_mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
     notes = record_of(found, unposed(range(count), focal), "0", [])["notes"]
-    assert any(f"An estimate from {count} photographs is often 5 % off" in n for n in notes) is said
+    assert any(f"an estimate from {count} photographs is often 5 % off" in n for n in notes) is said
     assert not any("times their longer side" in n for n in notes)
     stretched = {"focal": 900, "distortion": 0, "width": 320, "height": 240}
     notes = record_of(found_mapping(cameras=(stretched,)), unposed(range(5), focal), "0", [])["notes"]
@@ -429,7 +427,7 @@ def test_records_reasons_and_advice():
     assert "matches no other" in reason(found_mapping(matches={}), 3, names)
     said = advice(found, names)
     for line, words in zip(
-        said, ("between d and c", "take e again", "b and c, whose axes differ by 50", "only 40 matches"), strict=True
+        said, ("between d and c", "take e again", "b and c, 50 degrees apart", "only 40 matches"), strict=True
     ):
         assert words in line
     joined = found_mapping(matches={(0, 1): 200, (1, 2): 90, (2, 3): 9, (3, 4): 300}, keypoints=(900, 800, 700, 600, 500))
@@ -440,7 +438,7 @@ def test_records_reasons_and_advice():
         matches={(0, 1): 200, (1, 2): 90, (3, 4): 40, (4, 5): 50, (2, 4): 8, (1, 5): 5, (5, 6): 20},
     )  # fmt: skip
     bridge, other = advice(apart, [*names, "f", "g"])
-    assert "between e and c" in bridge and bridge.endswith("3 photographs form a separate group, d to f")
+    assert "between e and c" in bridge and bridge.endswith("3 form a separate group, d to f")
     assert "photographs from g to the others" in other, "a photograph without a pose is no place to start from"
     assert (
         "from d to the photographs outside its group" in advice(dataclasses.replace(apart, matches={}), [*names, "f", "g"])[0]

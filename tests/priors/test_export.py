@@ -123,7 +123,7 @@ def test_the_architecture_gives_in_onnxruntime_what_it_gives_in_torch(name, shap
 def test_weights_of_ones_own(tmp_path):
     from safetensors.torch import save
 
-    with pytest.raises(UsageError, match="no public weights"):
+    with pytest.raises(UsageError, match="has no public weights"):
         build(ExportRequest("fcn-resnet18"))
     path = tmp_path / "w.safetensors"
     path.write_bytes(save({"x": torch.zeros(1)}))

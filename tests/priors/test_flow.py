@@ -171,7 +171,7 @@ def test_flow_is_measured_on_its_way_back():
 def test_folder_and_files_of_flow(tmp_path):
     """Both naming schemes are found and resized; a missing pair is None, a folder without flow an error."""
     views, depths = still_life()
-    with pytest.raises(DataError, match=r"000-to-001\.flo"):
+    with pytest.raises(DataError, match=r"000-to-002\.flo"):
         flow_between(views, str(tmp_path))
     flow = exact_flow(views, depths)
     write_flo(tmp_path / "000-to-001.flo", flow(0, 1))

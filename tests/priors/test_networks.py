@@ -131,7 +131,7 @@ PLACED = placed()
 def test_weights_in_another_file_are_refused_though_it_exists(tmp_path, where, monkeypatch):
     np.ones(1, "<f4").tofile(tmp_path / "weights.bin")
     monkeypatch.chdir(tmp_path)  # onnxruntime would look for them here
-    with pytest.raises(DataError, match="weights of 'k' are in another file"):
+    with pytest.raises(DataError, match="its weights are in another file"):
         opened(tmp_path, PLACED[where])
 
 
@@ -351,7 +351,7 @@ def test_sizes_of_free_inputs_and_resizing():
 
 def test_outputs_that_are_no_depth_are_refused(tmp_path):
     network = Network(nw.depth_network(tmp_path / "d.onnx"))
-    with pytest.raises(DataError, match=r"smallest depth is .*JSON file beside it"):
+    with pytest.raises(DataError, match=r"has depths of 0; .* into its JSON"):
         network_disparity(network, Preprocessing(32, 32, (6.0,) * 3, (0.2,) * 3, "depth"), photo(32, 32))
     network = Network(nw.segmentation_network(tmp_path / "s.onnx"))
     with pytest.raises(DataError, match=r"shape \(1, 21, 384, 384\), not that of one depth map"):

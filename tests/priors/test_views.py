@@ -87,7 +87,7 @@ def test_maps_are_kept_and_found_again(tmp_path, folder):
     first, notes = view_priors(views, config)
     assert len(list(folder.iterdir())) == 4 and not any("from the cache" in n for n in notes)
     second, notes = view_priors(views, config)
-    assert f"priors: 4 of 4 maps were read from the cache {folder}" in notes
+    assert f"priors: 4 of 4 maps read from the cache {folder}" in notes
     for f, s in zip(first, second):
         for name in ("disparity", "confidence", "boundary", "foreground"):
             np.testing.assert_array_equal(getattr(f, name), getattr(s, name))
@@ -109,7 +109,7 @@ def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
         check(p, (32, 64))
     text = "\n".join(notes)
     assert "gave the foreground of a.png" in text
-    assert "no score for c.png, 0.png, 1.png, 2.png, 3.png and 2 more views, which have hardly any foreground" in text
+    assert "no score for c.png, 0.png, 1.png, 2.png, 3.png and 2 more, which have hardly any foreground" in text
 
 
 def test_regions_and_classical_sources_say_so():
@@ -130,8 +130,8 @@ def test_regions_and_classical_sources_say_so():
     assert a.disparity[near].min() > a.disparity[~near].max() and f"{valid.mean():.1%}" in a.depth_source
     assert not b.disparity.any() and b.depth_source == "none"
     text = "\n".join(notes)
-    assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no consistent depth in b.png" in text
-    assert "saliency is used as foreground" in text and "--segmentation-model" in text
+    assert f"0.0% to {valid.mean():.1%} of the pixels" in text and "no consistent depth in b.png" in text
+    assert "saliency as foreground" in text and "--segmentation-model" in text
 
 
 def test_both_networks_are_opened_before_one_runs(tmp_path, monkeypatch):

@@ -108,7 +108,7 @@ def test_the_fastest_rule_within_the_error(device, measure, reduce):
             slower, less = select_rule(g, views, max_error=0.99 * error, **given)
             assert slower == FASTEST_FIRST[number + 1] and 0 < less < error
         else:
-            with pytest.raises(UsageError, match=rf"no rule keeps the {measure} error within .* rounding alone gives"):
+            with pytest.raises(UsageError, match=rf"rounding alone gives a {measure} error of"):
                 select_rule(g, views, max_error=0.99 * error, **given)
 
 

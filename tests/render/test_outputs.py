@@ -304,7 +304,7 @@ def test_tensors_of_another_shape_in_the_backward_pass_are_refused(most):
         render = rasterize(gaussians, camera(dtype=torch.float32), RasterizeOptions(max_instances=most))
         tensor = getattr(gaussians, name)
         tensor.data = torch.rand(7, *tensor.shape[1:])
-        with pytest.raises(RuntimeError, match=r"replaced between .*\[30.*, now \[7"):
+        with pytest.raises(RuntimeError, match=r"replaced between .*\[30.*, now .*\[7"):
             render.rgb.sum().backward()
 
 
@@ -339,7 +339,7 @@ def test_create_graph_changes_no_gradient_and_transforms_of_functions_are_refuse
         "jvp": lambda: torch.func.jvp(loss, (means,), (means,)),
     }
     for call in calls.values():
-        with pytest.raises(UsageError, match=r"torch\.func .*use torch\.autograd.*a batch of cameras"):
+        with pytest.raises(UsageError, match=r"torch\.func: use torch\.autograd.*a batch of cameras"):
             call()
     jacobian = torch.autograd.functional.jacobian(loss, means)  # the way that works
     assert torch.equal(jacobian, torch.autograd.grad(loss(gaussians.means), gaussians.means)[0])

@@ -106,7 +106,7 @@ def test_arguments_of_another_type_or_shape_are_named():
         (TypeError, "camera.viewmat must be a numpy array or a tensor, not list", seen(viewmat=[[1.0]])),
         (TypeError, "camera.K must be .*, not NoneType", seen(K=None)),
         (TypeError, "camera.distortion must be .*, not list", seen(distortion=[0.0])),
-        (TypeError, "camera.K must hold real numbers, not complex128", seen(K=1j * np.eye(3))),
+        (TypeError, "camera.K must be float32 or float64, not complex128", seen(K=1j * np.eye(3))),
         (ValueError, "camera.viewmat has non-finite values", seen(viewmat=np.full((4, 4), np.nan))),
         (UsageError, "unknown camera model None", seen(model=None)),
         *((TypeError, f"camera.{n} must be dense, not torch.sparse_coo", seen(**{n: t})) for n, t in sparse.items()),

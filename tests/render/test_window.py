@@ -127,7 +127,7 @@ def test_no_pixel_at_all(device):
 @pytest.mark.parametrize(
     ("pixels", "kind", "match"),
     [
-        (torch.zeros(3, 2), TypeError, "whole numbers"), ([[1, 2]], TypeError, "whole numbers"),
+        (torch.zeros(3, 2), TypeError, "integers"), ([[1, 2]], TypeError, "integers"),
         (torch.zeros(3, 3, dtype=torch.int64), ValueError, r"\[P, 2\] or \[2, P, 2\]"),
         (torch.zeros(3, 4, 2, dtype=torch.int64), ValueError, r"\[P, 2\] or \[2, P, 2\]"),
         (torch.tensor([[75, 0]]), ValueError, "leave the 75 x 53"), (torch.tensor([[0, -1]]), ValueError, "leave the"),

@@ -88,8 +88,7 @@ class WarpgsModel(SplatfactoModel):
         names = [f.name for f in fields(usual) if f.name not in USED]
         changed = [n.replace("_", "-") for n in names if getattr(self.config, n) != getattr(usual, n)]
         if changed:
-            fix = "leave it out, and give settings of the fit in a file, --pipeline.model.preset FILE.toml"
-            raise warpgs.UsageError(f"--pipeline.model.{changed[0]}: warpgs does not use splatfacto's settings; {fix}")
+            raise warpgs.UsageError(f"--pipeline.model.{changed[0]} is splatfacto's; use --pipeline.model.preset FILE.toml")
         self.seed_points = None
         super().populate_modules()
         self.register_buffer("behind", torch.zeros(3, dtype=torch.float32, device="cpu"))

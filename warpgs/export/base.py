@@ -18,8 +18,8 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from warpgs.errors import DataError, MalformedError, UsageError, expect
-from warpgs.files import open_input, read_input, unread_reason, write_bytes, write_json
+from warpgs.errors import DataError, MalformedError, UsageError, expect, explained
+from warpgs.files import open_input, read_input, write_bytes, write_json
 from warpgs.geometry import checked_normalization, convert_gaussians, rotate
 from warpgs.plugins import Registry, returned
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors, checked_origin
@@ -43,8 +43,7 @@ _AXES = (
 
 def malformed(path: Path, what: str) -> DataError:
     """Return a DataError about a file that does not match its suffix, with the fix."""
-    fix = "Export the model again, or use another format."
-    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. {fix}")
+    return DataError(f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export it again, or use another format")
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
@@ -116,12 +115,11 @@ def arrays_to_write(
         arrays = arrays_of(g)
         for name, array in arrays.items():
             if bad := array.size - int(np.isfinite(array).sum()):
-                fix = "export an earlier checkpoint, or fit again with a lower learning rate"
-                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; {fix}")
+                raise DataError(f"{path}: {bad} of {array.size} values of {name} are not finite; export an earlier checkpoint")
     logits = arrays["logit_opacities"]
     if logits.size and 0 <= logits.min() < logits.max() <= 1:
         words = "all logit_opacities are in [0, 1], as opacities are; ActivatedGaussians(...).stored() makes logits"
-        warnings.warn(f"{path}: {words} and log scales", stacklevel=2)
+        warnings.warn(f"{path}: {words}", stacklevel=2)
     if origin.any():
         arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
     return arrays, origin
@@ -256,10 +254,8 @@ unknown methods as NotImplementedError, and seeks before the start as OSError.""
 @contextmanager
 def reading(path: Path, whole: bool = False) -> Iterator[BinaryIO]:
     """Open a file, or read the ``whole`` file; errors of opening and of decoding become a DataError."""
-    try:
+    with explained(f"{path}: cannot be read", "check the path and its permissions"):
         file: BinaryIO = io.BytesIO(read_input(path)) if whole else open_input(path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
     try:
         with file, np.errstate(all="ignore"):  # infinities and NaN are named afterwards, with their Gaussian
             yield file
@@ -373,9 +369,7 @@ class Format:
         if self.max_degree == 0:
             arrays["sh"] = arrays["sh"][:, :1]
         elif gaussians.sh_degree > self.max_degree:
-            most = f"{self.suffix} files hold harmonics up to degree {self.max_degree}, not {gaussians.sh_degree}"
-            fix = f"--sh-degree {self.max_degree}, in Python with sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
-            raise DataError(f"{path}: not written, {most}. Drop higher degrees with {fix}")
+            raise DataError(f"{path}: degree {gaussians.sh_degree} is too high; give --sh-degree {self.max_degree}, or .ply")
         pieces = returned(self, "encode", self.encode(arrays), Iterable, "an iterable of bytes")
         self.store(path, [returned(self, "encode", p, BYTES, "an iterable of bytes") for p in pieces])
         if type(self).origin_in is Format.origin_in:
@@ -507,8 +501,7 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
         raise UsageError(f"{path}: is the folder of a SOG model; give {Path(path) / 'meta.json'}")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
     one = f"use one of {', '.join(k.suffix for k in known)}, or give a format of your own{cameras}"
-    others = "`warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
-    raise UsageError(f"{path}: format {Path(path).suffix or '(none)'} is not supported; {one}. {others}")
+    raise UsageError(f"{path}: format {Path(path).suffix or '(none)'} is not supported; {one}")
 
 
 def write_gaussians(

@@ -174,8 +174,7 @@ def _places(document: dict[str, Any], mesh: int) -> list[np.ndarray]:
             product = place[:3, :3].T @ place[:3, :3]
             square = np.trace(product) / 3
             alike = square > 0 and np.isfinite(place).all() and np.abs(product / square - np.eye(3)).max() <= MAX_SHEAR
-            scales = f"node {i} scales Gaussians by different factors, 0 or with shear"
-            expect(alike, f"{scales}; apply that scale in another program")
+            expect(alike, f"node {i} scales Gaussians by different factors, 0 or with shear; apply that in another program")
             found.append(place)
     shown = len(found) <= MAX_COPIES and (found or not any(n.get("mesh") == mesh for n in nodes))
     expect(shown, f"its scene shows the Gaussians {len(found)} times (supported: 1 to {MAX_COPIES})")
@@ -238,8 +237,7 @@ def _primitive(document: dict[str, Any]) -> tuple[dict[str, Any], int]:
     expect(len(found) == 1, f"it has {len(found)} primitives with {EXTENSION}; exactly one is supported")
     extension = found[0][0]["extensions"][EXTENSION]
     kernel, space = extension.get("kernel"), extension.get("colorSpace")
-    given = f"kernel {str(kernel)[:40]!r} or colour space {str(space)[:40]!r} is not supported"
-    expect((kernel, space) == ("ellipse", COLOR_SPACE), f"{given} (supported: 'ellipse', {COLOR_SPACE!r})")
+    expect((kernel, space) == ("ellipse", COLOR_SPACE), f"kernel {str(kernel)[:40]!r} or {str(space)[:40]} is not supported")
     expect(not extension.get("extensions"), "its Gaussians are compressed by a further extension; export them uncompressed")
     return found[0]
 

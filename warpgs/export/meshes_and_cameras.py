@@ -190,8 +190,7 @@ def write_cameras(
         write_json(path, [_inria(i, n, c) | _stated(origin) for i, (n, c) in enumerate(zip(stems, cameras))])
         off = max((max(abs(c.K[0, 2] - c.width / 2), abs(c.K[1, 2] - c.height / 2)) for c in cameras), default=0.0)
         if off > MAX_OFF_CENTER:
-            fix = "write transforms.json to keep them"
-            notes.append(f"cameras.json stores no principal points, which are up to {off:.1f} px off the image centre; {fix}")
+            notes.append(f"cameras.json stores no principal points, which are up to {off:.1f} px off; write transforms.json")
     return notes
 
 

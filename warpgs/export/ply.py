@@ -18,9 +18,7 @@ from warpgs.export import base
 from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, PlyElement, ply_header, replacing
 from warpgs.scene import ORIGIN, Gaussians, Normalization, base_coefficients, base_colors
 
-MODES = re.compile(
-    rb"^comment[ \t]+(?:splatrendermode[ \t:]+(\S+)|antialiased[ \t:]+(\S+))[ \t]*\r?$", re.MULTILINE | re.IGNORECASE
-)
+MODES = re.compile(rb"^comment[ \t]+(?:splatrendermode[ \t:]+(\S+)|antialiased[ \t:]+(\S+))[ \t]*\r?$", re.M | re.I)
 """Comments of Brush and Postshot that declare antialiasing."""
 
 
@@ -29,27 +27,14 @@ def mode_comments(antialiased: bool) -> tuple[str, str]:
     return f"comment SplatRenderMode: {'mip' if antialiased else 'default'}", f"comment antialiased {int(antialiased)}"
 
 
-def origin_stated(head: bytes) -> list[str] | None:
-    """Return the words of the comment that `base.origin_comment` made; None without one."""
-    line = re.search(rf"^comment {ORIGIN} (.*)$".encode(), head.partition(b"end_header")[0], re.MULTILINE)
-    return None if line is None else line[1].decode("utf-8", "replace").split()
-
-
 def declared(head: bytes) -> bool:
     """Return whether a header, which is checked, declares antialiasing; the last such comment decides."""
     found = False
     for mode, value in MODES.findall(head[: ply_header(head)[1]]):
-        known = mode.lower() in (b"", b"default", b"mip")
-        expect(
-            known, f"render mode {mode[:40].decode('utf-8', 'replace')!r} is not supported; train with mode 'default' or 'mip'"
-        )
-        found = mode.lower() == b"mip" or value.lower() in (b"1", b"true")
+        text = mode.decode("utf-8", "replace").lower()
+        expect(text in ("", "default", "mip"), f"render mode {text[:40]!r} is not supported; train in mode 'default' or 'mip'")
+        found = text == "mip" or value.lower() in (b"1", b"true")
     return found
-
-
-def is_own(head: bytes) -> bool:
-    """Return whether a header has both comments of `mode_comments`, of which other programs write one or none."""
-    return any("\n".join(mode_comments(antialiased)).encode() in head for antialiased in (True, False))
 
 
 # The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
@@ -222,16 +207,19 @@ class _HeadedFormat(base.Format):
     declares = True
 
     def origin_in(self, path: Path) -> object:
-        """Return the origin in the header's comments."""
-        return origin_stated(start_of(path))
+        """Return the words of the comment that `base.origin_comment` made; None without one."""
+        head = start_of(path).partition(b"end_header")[0]
+        line = re.search(rf"^comment {ORIGIN} (.*)$".encode(), head, re.MULTILINE)
+        return None if line is None else line[1].decode("utf-8", "replace").split()
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
         return declared(start_of(path))
 
     def is_own(self, path: Path) -> bool:
-        """Return whether the header has the comments of warpgs."""
-        return is_own(start_of(path))
+        """Return whether the header has both comments of `mode_comments`, of which other programs write one or none."""
+        head = start_of(path)
+        return any("\n".join(mode_comments(antialiased)).encode() in head for antialiased in (True, False))
 
 
 @base.register("compressed_ply")
@@ -405,9 +393,7 @@ def _plain(path: Path, file: BinaryIO, notes: list[str]) -> base.Arrays:
         notes.append(f"{path}: filter_3D of Mip-Splatting is applied to sizes and opacities")
     logits, scales = arrays["logit_opacities"], arrays["log_scales"]
     if n >= LEAST_JUDGED and logits.min() >= 0 and logits.max() <= 1 and scales.min() > 0:
-        values = f"all opacities are from {logits.min():.2g} to {logits.max():.2g} and all log scales above 0"
-        why = "as if stored after the sigmoid and the exponential; they are read as logits and logarithms"
-        notes.append(f"{path}: {values}, {why}. If images are foggy, export the model again without activations")
+        notes.append(f"{path}: opacities look activated. If images are foggy, export the model again without activations")
     return arrays
 
 

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from warpgs.errors import DataError, MalformedError, UsageError, expect, install_extras
+from warpgs.errors import DataError, MalformedError, UsageError, expect, explained, install_extras
 from warpgs.export import base
 
 Section = Callable[[int], bytes]
@@ -241,10 +241,9 @@ def _quats(data: np.ndarray) -> np.ndarray:
 
 def _zstandard():
     """Return the module zstandard; UsageError where it is missing."""
-    try:
+    fix = f"{install_extras('formats')}, or use version 3"
+    with explained("SPZ version 4 needs zstandard", fix, ImportError, UsageError):
         import zstandard
-    except ImportError as e:
-        raise UsageError(f"SPZ version 4 needs zstandard; {install_extras('formats')}, or use version 3") from e
     return zstandard
 
 
@@ -266,10 +265,7 @@ class SPZ(base.Format):
     sorted = True
     declares = True
     max_degree = 4
-    note = (
-        "SPZ files have y up, as Niantic defines it. SuperSplat, splat-transform 3, gsply and gaussforge take y as down, so "
-        "models appear upside down: for files to or from these programs, pass --rotate 1,0,0,180"
-    )
+    note = "SPZ has y up, as Niantic defines it; SuperSplat, gsply and others take y as down: for them pass --rotate 1,0,0,180"
     decode = staticmethod(decode)
 
     def encode(self, arrays: base.Arrays) -> list[bytes]:

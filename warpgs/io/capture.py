@@ -83,8 +83,7 @@ def _points(scene: SceneFolder, path: Path, views: list[View]) -> tuple[PointClo
     some = points.points[:: max(1, len(points) // COMPARED_POINTS)]
     seen = {i for view in views for i in seen_pixels(view.camera, some)[0].tolist()}
     if len(seen) < MIN_SHARE * len(some):
-        where = "export cameras and points in the same coordinate system"
-        return None, [f"the points of {ply.name} are left out: {len(seen) / len(some):.0%} of them are in some view; {where}"]
+        return None, [f"the points of {ply.name} are left out, as few are in a view; export both in one coordinate system"]
     return points, [f"points taken from {ply.name}", *(bad or [])]
 
 
@@ -137,8 +136,7 @@ def _sensor_lens(sensor: ElementTree.Element | None, where: str) -> Lens:
     if others is None:
         raise DataError(f"{where}: {kind[:40]} cameras are not supported; export frame cameras")
     if lacking := [t for t in others if terms[t]] + ["b2"] * (not abs(terms["b2"]) <= MAX_SKEW * abs(terms["f"])):
-        fix = "fix it to 0 in Tools > Camera Calibration and optimize the cameras, or export undistorted photographs"
-        raise DataError(f"{where}: {lacking[0]} of a {kind} camera is not supported; {fix}")
+        raise DataError(f"{where}: {lacking[0]} of a {kind} camera is not supported; fix it to 0, or export undistorted images")
     # Metashape's p1 is OpenCV's p2
     order = ("k1", "k2", "k3", "k4") if kind == "fisheye" else ("k1", "k2", "p2", "p1", "k3")
     return _lens(terms["f"], terms["b1"], [terms["cx"], terms["cy"]], resolution, [terms[t] for t in order], kind, where)
@@ -236,8 +234,7 @@ class RealityScanReader(CaptureReader):
                 angles = -values["heading"], values["pitch"], values["roll"]
                 name, R = row["name"].strip(), Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
             if values.get("k4"):
-                fix = "align with the distortion model Brown3 or Brown3 with tangential2, or export undistorted images"
-                raise DataError(f"{where}: k4 is not supported; {fix}")
+                raise DataError(f"{where}: k4 is not supported; align with the model Brown3, or export undistorted images")
             pose = np.column_stack([R, [values["x"], values["y"], values["alt"]]])
             viewmat = scenes.from_camera_to_world(pose, where, opengl=True)
             rows.append((name, partial(_film_lens, values, f"{where}, image {name[:80]!r}"), viewmat))

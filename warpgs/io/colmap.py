@@ -7,13 +7,13 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, expect, listed
+from warpgs.errors import DataError, expect, explained, listed
 from warpgs.files import MAX_HEADER_BYTES, PLY_LIST, open_input, ply_header, read_file
 from warpgs.geometry import pose_of
 from warpgs.io import folder as scenes
@@ -71,8 +71,7 @@ class _BinaryFile:
         (count,) = self.take("Q")
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
-            fix = "truncated or foreign. Copy it again"
-            raise DataError(f"{self.path}: announces {count:,} records and holds at most {capacity:,}: {fix}")
+            raise DataError(f"{self.path}: truncated: {count:,} records announced, at most {capacity:,} found. Copy it again")
         for _ in range(count):
             yield self
         if self.at != len(self.data):
@@ -111,13 +110,13 @@ def origin_stated(path: Path) -> np.ndarray:
     return checked_origin(words[2:], str(path)) if words[:2] == ["#", ORIGIN] else np.zeros(3)
 
 
-@contextmanager
-def understood(where: str, *errors: type[Exception]) -> Iterator[None]:
+PARSING = (ValueError, LookupError, OverflowError, TypeError, AttributeError)
+"""Errors of parsing."""
+
+
+def understood(where: str, *errors: type[Exception]) -> AbstractContextManager[None]:
     """Turn errors of parsing, and others that are named, into a DataError that names the place."""
-    try:
-        yield
-    except (ValueError, LookupError, OverflowError, *errors) as e:
-        raise DataError(f"{where}: cannot be understood ({e}); write the file again") from e
+    return explained(f"{where}: cannot be understood", "write the file again", (*PARSING, *errors))
 
 
 NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:ind|qnan|snan)\d*)", re.IGNORECASE)
@@ -161,8 +160,7 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
         """Refuse a model; FULL_OPENCV without rational terms is OPENCV with k3, which can be undistorted."""
         if model not in known and not (model == "FULL_OPENCV" and not any(parameters[9:])):
             kept = ", or fit with --lenses native" if model in counts else ""
-            fix = f"Run `colmap image_undistorter` and give its output folder{kept}"
-            raise DataError(f"{path}: camera model {model} is not supported (supported: {', '.join(known)}). {fix}")
+            raise DataError(f"{path}: camera model {model} is not supported. Run `colmap image_undistorter`{kept}")
 
     if path.suffix == ".bin":
         for r in _BinaryFile(path).records(24):
@@ -230,8 +228,7 @@ def without_unaligned(
     if strict or not kept or len(kept) == len(poses):
         return poses, []
     names = listed(sorted(pose[0] for number, pose in poses.items() if number not in kept))
-    count = f"{len(poses) - len(kept)} of {len(poses)} images of {file.name}"
-    return kept, [f"left out: {count} have a pose or camera that is not finite: {names}"]
+    return kept, [f"left out: {len(poses) - len(kept)} of {len(poses)} images, as pose or camera is not finite: {names}"]
 
 
 def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) -> Iterator[tuple[str, Lens, np.ndarray]]:
@@ -297,7 +294,7 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
     See `_cloud` for ``notes``.
     """
     data = read_file(path, fix="fix its permissions or copy it again")
-    try:
+    with explained(f"{path}: the points cannot be understood", "export them again as PLY, or remove the file", PARSING):
         elements, start, text = ply_header(data[:MAX_HEADER_BYTES])
         name, count, properties = elements[0] if elements else ("", 0, [])
         kinds, body = dict(properties), data[start:]
@@ -311,8 +308,6 @@ def read_ply_points(path: Path, notes: list[str] | None = None) -> PointCloud:
         else:
             table = np.frombuffer(body, np.dtype(properties), count)
             values = {n: table[n].astype(np.float64) for n in kinds}
-    except (ValueError, OverflowError) as e:
-        raise DataError(f"{path}: the points cannot be understood ({e}); export them again as PLY, or remove the file") from e
     rgb = next((c for c in COLORS if kinds.keys() >= set(c)), [])
     colors = np.stack([values[c] for c in rgb], 1) if rgb else np.full((count, 3), 127.0)
     if not rgb and notes is not None:
@@ -369,16 +364,14 @@ def reconstruction(root: Path, named: str | None = None) -> tuple[Model | None, 
     names = [m[0].relative_to(root).as_posix() for m in models]
     counts = ", ".join(f"{name}: {size}" for name, size in zip(names, sizes))
     chosen = best[0].relative_to(root).as_posix()
-    among = f"of {len(models)} reconstructions (images in {counts})"
-    return best, f"{chosen} is the largest {among}; --reconstruction FOLDER takes another"
+    return best, f"{chosen} is the largest reconstruction (images in {counts}); --reconstruction FOLDER takes another"
 
 
 def _size(model: Model) -> int:
     """Return the number of posed images of a complete reconstruction; 0 for a damaged file, so that another one is taken."""
-    try:
+    with suppress(DataError):
         return len(read_poses(model[0] / f"images.{model[1]}"))
-    except DataError:
-        return 0
+    return 0
 
 
 def image_base(root: Path, model: Path) -> str | None:
@@ -433,8 +426,7 @@ def _image_paths(
     found = {n: p for n, p in found.items() if claims[p] == 1 and p not in taken}
     if images != scene.root / base and len(lost) == len(names) == len(files) > len(found):
         pairs = dict(zip(sorted(names), files))
-        order = f"images of {images.name} matched in sorted order, because their names differ"
-        return pairs, [f"{order} ({min(names)} is {pairs[min(names)].name})"]
+        return pairs, [f"images of {images.name} matched in sorted order: {min(names)} is {pairs[min(names)].name}"]
     for n in (n for n in outside if n not in found):
         elsewhere = scenes.is_absolute(n) and not Path(n).exists()
         paths[n] = images / scenes.missing_name(n) if elsewhere else scene.child(images, n, where)  # which refuses
@@ -477,9 +469,7 @@ def add_views(
 class ColmapReader(Reader):
     """COLMAP reconstructions, binary or text, with their image folder."""
 
-    description = (
-        "sparse/0, sparse, dense/0/sparse, colmap/sparse/0 or the folder itself with cameras and images .bin/.txt (COLMAP)"
-    )
+    description = "sparse/0, sparse, dense/0/sparse, colmap/sparse/0 or the folder with cameras and images .bin/.txt (COLMAP)"
     priority = 10
 
     def probe(self, folder: Path) -> Probe | None:

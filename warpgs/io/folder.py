@@ -19,7 +19,7 @@ import numpy as np
 
 from warpgs.constants import POSE_TOLERANCE
 from warpgs.device import machine_memory, usable_cores
-from warpgs.errors import DataError, UsageError, listed, shortened
+from warpgs.errors import DataError, UsageError, expect, explained, listed, shortened
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, pose_at, pose_of, rotation_matrices
 from warpgs.io.image_files import READ, decode, unread_note
@@ -142,9 +142,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     first = 1 if min(ids) == 1 and not named_by_dtu(names) else 0  # files renamed 001, 002, ... count from one
     by_id = {i - first: name for i, name in zip(ids, names)}
     if missing := [i for i in range(max(least, len(names))) if i not in by_id]:
-        counted = f"(ids are counted from 0, names run from {names[0]} to {names[-1]})"
-        fix = "restore them, because the protocol's ids would otherwise select other views"
-        raise DataError(f"{where}: images with the ids {listed(missing, 8)} are missing {counted}; {fix}")
+        raise DataError(f"{where}: images with the ids {listed(missing, 8)}, counted from 0, are missing; restore them")
     return {i: by_id[i] for i in wanted}
 
 
@@ -263,12 +261,9 @@ class SceneFolder:
             DataError: The name cannot be one of a file, or points outside.
         """
         usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
-        try:
-            encoded = usable and str(name).encode("utf-8", "surrogateescape")
-        except UnicodeEncodeError:
-            encoded = b""
-        if not encoded:
-            raise DataError(f"{where}: {str(name)[:80]!r} is not a file name; name an image file")
+        with explained(f"{where}: {str(name)[:80]!r} is not a file name", "name an image file", ValueError):
+            expect(usable, "it is empty, too long or no text")
+            str(name).encode("utf-8", "surrogateescape")
         path = folder / str(name)
         if "\\" in str(name) and not path.is_file():
             path = folder / str(name).replace("\\", "/")  # written on Windows
@@ -372,9 +367,8 @@ class SceneFolder:
             of_unmasked, of_known = ({f for n in names for f in masks.get(n, [])} for names in (unmasked, known))
             if lone := [f for f in files if f in of_unmasked or f not in of_known]:
                 image = min(unmasked.values())
-                lost = f"{len(lone)} of {len(files)} files in {folder.name} match no image or several"
-                fix = f"name a mask like its image: {image.with_suffix('.png')} or {image}.png"
-                notes.append(f"{lost}, such as {lone[0].relative_to(folder)}; {fix}")
+                lost = f"{len(lone)} of {len(files)} files in {folder.name}, such as {lone[0].relative_to(folder)},"
+                notes.append(f"{lost} match no image or several; name a mask like its image: {image.with_suffix('.png')}")
         return notes
 
     def images(self, base: str = "images") -> tuple[Path, int, str]:
@@ -399,8 +393,7 @@ class SceneFolder:
             note = unread_note(folder) or f"missing, or without images ({READ}); put the images into it"
             raise DataError(f"{folder}: {note}")
         largest = others[min(others)]
-        note = f"no full-size folder '{base}': images taken from {largest.name}{how and ', '}{how}"
-        return self.inside(largest), downscale, note
+        return self.inside(largest), downscale, f"no folder '{base}': images taken from {largest.name}{how and ', '}{how}"
 
     def pixel_source(self, by_folder: bool) -> str:
         """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the kind of resampling.
@@ -450,9 +443,8 @@ def matched_note(found: dict[str, Path], place: str, root: Path, noun: str = "im
     """Return the note on names that another file than that of their spelling was ``found`` for; [] for none."""
     if not found:
         return []
-    first, count = min(found), f"{len(found)} {noun}{'s' if len(found) != 1 else ''}"
-    how = "matched by their names without suffix, case or folder"
-    return [f"{count} of {place} {how} ({first} is {found[first].relative_to(root)})"]
+    first, count = min(found), f"{len(found)} {noun}{'s' if len(found) != 1 else ''} of {place}"
+    return [f"{count} matched by their names without suffix, case or folder ({first} is {found[first].relative_to(root)})"]
 
 
 def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: bool) -> list[str]:
@@ -551,8 +543,8 @@ class ViewList:
         notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
         if self._narrow:
             name, left = min(self._narrow.items(), key=lambda item: item[1])
-            fix = "check the distortion, or use --lenses native"
-            notes.append(f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}; {fix}")
+            many = f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}"
+            notes.append(f"{many}; check it, or use --lenses native")
         cutout = options is not None and options.masks == "cutout"
         if options is None or not self._kept:
             return [*notes, "--masks cutout changes nothing: no image has a mask file"] if cutout else notes

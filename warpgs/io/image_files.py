@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpgs.errors import DataError, ResourceError, expect
-from warpgs.files import read_input, read_start, unread_reason
+from warpgs.errors import DataError, ResourceError, expect, explained
+from warpgs.files import read_input, read_start
 
 if TYPE_CHECKING:
     from PIL import ImageFile
@@ -91,13 +91,10 @@ BYTES_PER_PIXEL = 32
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None = None) -> bytes:
     """Return the bytes of an image file, or its first ``start``; files too large for ``max_pixels`` pixels are rejected."""
-    try:
+    with explained(f"{path}: the image cannot be read", "restore it, or remove its camera"):
         if start is not None:
             return read_start(path, start)
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
-    except OSError as e:
-        fix = "restore it, or remove its camera from the scene"
-        raise DataError(f"{path}: the image cannot be read ({unread_reason(e)}); {fix}") from e
 
 
 # Size and damage. Functions take the bytes of a file, and raise a ValueError with the reason as part of a sentence.
@@ -178,7 +175,7 @@ def _decoded(name: str, data: bytes) -> np.ndarray | None:
             pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
         return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
     if name == "WEBP":
-        expect(any(kind in WEBP_PIXELS for kind, _ in _webp_chunks(data)), "it holds no pixels")
+        expect(any(kind in WEBP_PIXELS for kind, _ in webp_chunks(data)), "it holds no pixels")
     elif name in ("PNG", "BMP"):
         with _opened(name, data) as image:
             plain = name != "BMP" or image.info.get("compression") not in BMP_RLE
@@ -266,7 +263,7 @@ WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
 """Chunks of a WebP that hold pixels: lossy, lossless, a frame of an animation."""
 
 
-def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+def webp_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Yield kind and contents of each chunk of a WebP; they must fill the length that the file announces."""
     expect(len(data) >= 20 and data[8:12] == b"WEBP", "it is not a WebP file")
     view = memoryview(data)
@@ -281,7 +278,7 @@ def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 def _webp_size(data: bytes) -> tuple[int, int]:
     """Return width and height [px] of a WebP; Pillow would allot its canvas first, up to a gigabyte."""
-    kind, body = next(_webp_chunks(data), (b"", memoryview(b"")))
+    kind, body = next(webp_chunks(data), (b"", memoryview(b"")))
     if len(body) >= 10 and kind == b"VP8X":
         return int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
     if len(body) >= 10 and kind == b"VP8 " and body[3:6] == b"\x9d\x01\x2a":
@@ -429,8 +426,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         width, height = header_size(name, data)
         if (pixels := width * height) > max_pixels:
             size = f"the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels"
-            needs = f"--max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
-            raise DataError(f"{path}: {size}; shrink it, or raise the limit with {needs}")
+            raise DataError(f"{path}: {size}; shrink it, or raise the limit with --max-pixels {pixels}")
         expect(pixels, f"it has {width} x {height} px")
         if (raster := _decoded(name, data)) is None:
             # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
@@ -438,11 +434,10 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         expect(raster is not None and raster.shape[:2] == (height, width), "its pixels cannot be read")
     except (cv2.error, MemoryError, ValueError) as e:
         if isinstance(e, MemoryError) or getattr(e, "code", None) == cv2.Error.StsNoMem:
-            needs = f"needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB of free memory"
-            raise ResourceError(f"{path}: decoding the image {needs}; shrink the image, or end other programs") from e
+            needs = BYTES_PER_PIXEL * pixels / 2**30
+            raise ResourceError(f"{path}: decoding the image needs {needs:.1f} GiB; shrink it, or end other programs") from e
         reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else e
-        fix = "Restore it from its source; if it looks right, save it as PNG"
-        raise DataError(f"{path}: the image cannot be decoded: {reason}. {fix}") from e
+        raise DataError(f"{path}: the image cannot be decoded: {reason}. Restore it, or save it as PNG") from e
     return raster
 
 
@@ -506,10 +501,9 @@ NO_EXIF: Exif = (1, "", "", None)
 
 def read_exif(data: bytes) -> Exif:
     """Return the EXIF values of an image file; damaged values count as missing."""
-    try:
+    with contextlib.suppress(ValueError):
         return parse_exif(_block(data))
-    except ValueError:
-        return NO_EXIF
+    return NO_EXIF
 
 
 def parse_exif(block: bytes) -> Exif:
@@ -548,7 +542,7 @@ def _block(data: bytes) -> bytes:
         head = itertools.takewhile(lambda segment: segment[0] != SOS, jpeg_segments(data))
         return next((body for marker, body, _ in head if marker == APP1 and body.startswith(PREFIX)), b"")
     if name == "WEBP":
-        return bytes(next((body for kind, body in _webp_chunks(data) if kind == b"EXIF"), b""))
+        return bytes(next((body for kind, body in webp_chunks(data) if kind == b"EXIF"), b""))
     if name in ("PNG", "AVIF"):
         with _opened(name, data) as image:
             return bytes(image.info.get("exif", b""))

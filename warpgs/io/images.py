@@ -158,8 +158,7 @@ class Lens:
         if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
             raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")
         if not ((f >= MIN_FOCAL * np.array([self.width, self.height])) & (f < MAX_INTRINSIC)).all():
-            fix = "calibrate again"
-            raise DataError(f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides, and finite; {fix}")
+            raise DataError(f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides; calibrate again")
         if not (np.abs(c) < MAX_INTRINSIC).all():
             raise DataError(f"{where}: the principal point {c.tolist()} px is not finite or too large; calibrate again")
         if not (np.abs(self.distortion) < MAX_DISTORTION).all():
@@ -327,8 +326,7 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
         return loaded
     small_w, small_h = round(width / factor), round(height / factor)
     if min(small_w, small_h) < MIN_SIDE:
-        fix = f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor or a longer side"
-        raise UsageError(f"{flags} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); {fix}")
+        raise UsageError(f"{flags} leaves {small_w} x {small_h} px of {path}; keep at least {MIN_SIDE} px of both sides")
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
     hides = loaded.mask if loaded.undone is None else None  # what the mask of an undistorted image hides is filled already
@@ -348,8 +346,7 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
         return mask
     # rounding a size may change it by one pixel of the smaller raster
     if abs(mask.shape[1] * height - mask.shape[0] * width) > max(height, width, *mask.shape):
-        fix = "the aspects differ. Give a mask made from this image"
-        raise DataError(f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: {fix}")
+        raise DataError(f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, of another aspect. Make it from this image")
     resized = _resize(mask.astype(np.float32), width, height)
     return resized > 0.5 if mask.dtype == bool else resized
 
@@ -361,8 +358,7 @@ def _upright(path: Path, lens: Lens, image: np.ndarray, data: bytes) -> int:
     orientation = read_exif(data)[0]
     if orientation not in (5, 6, 7, 8) or not _fits(image.shape[1::-1], lens):
         sizes = f"the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}"
-        fix = "the aspects differ, so the intrinsics cannot belong to it. Give the images that the cameras were made from."
-        raise DataError(f"{path}: {sizes}: {fix}")
+        raise DataError(f"{path}: {sizes}: the aspects differ. Give the images that the cameras were made from.")
     return orientation
 
 
@@ -487,5 +483,4 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         empty += float(nothing.mean()) / len(views)
         alpha = 1 - nothing.astype(np.float32)
         done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
-    these = f"the dark pixels around the object and in its holes ({empty:.1%} of all pixels)"
-    return done, f"every image shows an object on black: {these} become transparent; --no-black-is-empty keeps them"
+    return done, f"images show an object on black: {empty:.1%} become transparent; --no-black-is-empty keeps them"

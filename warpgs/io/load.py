@@ -11,8 +11,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, did_you_mean, listed, similar_folder
-from warpgs.geometry import FAR_OFF, camera_extent, matmul, near_cameras
+from warpgs.errors import DataError, UsageError, did_you_mean, explained, listed, similar_folder
+from warpgs.geometry import camera_extent, matmul, near_cameras
 from warpgs.io import folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder
 from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
@@ -31,10 +31,8 @@ def far_off_note(views: list[View], points: PointCloud | None) -> list[str]:
     """Return a note that names the cameras far off the rest, if there are any."""
     near = near_cameras(np.array([v.camera.center for v in views]), None if points is None else points.points)
     names = [v.name for v, n in zip(views, near) if not n]
-    return [
-        f"{len(names)} of {len(views)} cameras are far off the rest ({FAR_OFF:g} times the median distance) and do not set the "
-        f"scale: {listed(names, 5)}. Their poses may be wrong: estimate them again, or remove these images"
-    ] * bool(names)
+    which = f"{len(names)} of {len(views)} cameras are far off the rest and do not set the scale"
+    return [f"{which}: {listed(names, 5)}; their poses may be wrong: estimate them again"] * bool(names)
 
 
 def normalization_of(views: list[View], points: PointCloud | None, where: str) -> Normalization:
@@ -48,9 +46,7 @@ def normalization_of(views: list[View], points: PointCloud | None, where: str) -
     far = np.abs(centers).max(axis=1)
     if not (far < MAX_COORDINATE).all():
         worst = int(np.argmax(far))
-        far_off = f"beyond {MAX_COORDINATE:.0e} units, so the scene cannot be scaled"
-        which = f"{where}, image {views[worst].name!r}: its camera centre {centers[worst].tolist()}"
-        raise DataError(f"{which} is {far_off}; estimate its pose again, or remove the image")
+        raise DataError(f"{where}, image {views[worst].name!r}: its centre is beyond {MAX_COORDINATE:.0e} units; remove it")
     centers = centers[near_cameras(centers, None if points is None else points.points)]
     offset = centers.mean(0)
     extent = 1.1 * float(np.linalg.norm(centers - offset, axis=1).max())
@@ -79,8 +75,7 @@ def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointC
         moved = n.scale * (points.points - n.offset)
     far = int((~(np.abs(moved) < MAX_COORDINATE).all(axis=1)).sum())
     if far:
-        or_far = f"or farther than {MAX_COORDINATE:.0e} times the extent of the cameras"
-        raise DataError(f"{where}: {far} of {len(moved)} points are not finite, {or_far}; remove them, or reconstruct again")
+        raise DataError(f"{where}: {far} of {len(moved)} points are not finite, or too far from the cameras; remove them")
     return replace(points, points=moved)
 
 
@@ -122,9 +117,7 @@ class Split:
 
     def __post_init__(self):
         if both := set(self.train) & set(self.test):
-            raise DataError(
-                f"views {listed(sorted(both), 5)} are in training and in test, so scores would be meaningless; name each once"
-            )
+            raise DataError(f"views {listed(sorted(both), 5)} are in training and in test; name each once")
         if not self.train:
             raise DataError("the split leaves no training view; name at least one")
 
@@ -155,8 +148,7 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
     # r_10 sorts before r_2 by name; the ids count frames
     train, test = (sorted((n for n in names if n.split("/")[0] == s), key=_frame_number) for s in ("train", "test"))
     if len(train) <= max(BLENDER_TRAIN) or not test:
-        there = f"found {len(train)} and {len(test)}. Restore the scene, or use llff:K or every:N"
-        raise DataError(f"split {spec}: the Blender protocol picks from 100 frames in train and 200 in test; {there}")
+        raise DataError(f"split {spec}: needs 100 frames in train, 200 in test, not {len(train)} and {len(test)}; use every:N")
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
@@ -181,9 +173,8 @@ def _finder(names: list[str], spec: str) -> Callable[[str], str]:
                 return matches[0]
             if matches:
                 raise DataError(f"split {spec}: {wanted!r} could be any of {listed(matches, 5)}; give the whole name")
-        raise DataError(
-            f"split {spec}: no view {wanted!r}; {did_you_mean(wanted, names, 0.3) or f'the views are {listed(names, 3)}'}"
-        )
+        near = did_you_mean(wanted, names, 0.3) or f"the views are {listed(names, 3)}"
+        raise DataError(f"split {spec}: no view {wanted!r}; {near}")
 
     return find
 
@@ -286,8 +277,7 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
 
     height, width = view.image.shape[:2]
     if not abs((mask.shape[1] / mask.shape[0]) / (width / height) - 1) <= ASPECT_TOLERANCE:
-        sizes = f"the mask is {mask.shape[1]} x {mask.shape[0]} px, its image {view.name} {width} x {height}"
-        raise DataError(f"{path}: {sizes}: the aspects differ by more than two percent. Give the masks of these images")
+        raise DataError(f"{path}: its aspect is not that of {view.name}, {width} x {height} px; give the masks of these images")
     if mask.shape != (height, width):
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
     if view.mask is not None:  # pixels outside the lens or under a mask file have no reference
@@ -315,12 +305,9 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     if ids is None:
         raise DataError(f"{folder}: masks have image ids, the images ({views[0].name}, ...) no distinct ones; name them by id")
     if missing := sorted(set(ids) - set(masks)):
-        counted = "(ids are counted from 0; an image rect_001_... is id 0)"
-        fix = f"the masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
-        raise DataError(f"{folder}: no mask for image id {listed(missing, 8)} {counted}; {fix}")
+        raise DataError(f"{folder}: no mask for image id {listed(missing, 8)} (an image rect_001_... is id 0); restore it")
     if min(ids) == 1 and 0 in masks and not scenes.named_by_dtu([v.name for v in views]):
-        fix = "so the masks may be off by one; rename the images so that they count from 0, or remove mask 0"
-        raise DataError(f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, {fix}")
+        raise DataError(f"{folder}: the images start with 1, the masks with 0; let both count from 0, or remove mask 0")
     done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]) > 0.5, v)) for i, v in zip(ids, views)]
     return done, f"scores use only pixels inside the masks in {folder}, matched by image id; the fit ignores these masks"
 
@@ -419,7 +406,8 @@ def read_folder(
     on_image = None if progress is None else lambda name: progress(f"reading {root}: image {next(numbers)}")
     given = {f.name: getattr(options, f.name) for f in fields(SceneOptions)}
     checked = ReadOptions(**given | {"downscale": factor, "max_side": side, "on_image": on_image})
-    try:
+    # folders without permission, names too long for the file system, disks that fail
+    with explained(f"{root}: cannot be read", "fix its permissions or copy it"):
         if not root.is_dir():
             fix = "give a folder of photographs, or of images with their cameras"
             found = f"is a file; {fix}" if root.is_file() else f"no such folder; {similar_folder(root) or fix}"
@@ -432,9 +420,6 @@ def read_folder(
             raise UsageError("--reconstruction requires a COLMAP scene; leave it out, or give --reader colmap")
         scene = _finished(root, chosen, chosen.read(root, checked), notes, checked)
         return replace(scene, fingerprint=fingerprint(scene.views)) if hashed else scene
-    except OSError as e:
-        # folders without permission, names too long for the file system, disks that fail
-        raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
 
 
 def detect(root: Path) -> tuple[Reader, list[str]]:
@@ -470,8 +455,7 @@ def _accepted(root: Path, reader: Reader) -> Reader:
     if (probe := _probe(reader, root)) is None:
         others = [p.found for r in scenes.all_readers() if (p := _probe(r, root)) is not None]
         there = f"; the folder holds {' and '.join(others)}" if others else ""
-        wanted = f" ({reader.description})" if reader.description else ""
-        raise DataError(f"{root}: the reader {reader.name} finds no scene of its format{wanted}{there}. Choose another reader")
+        raise DataError(f"{root}: the reader {reader.name} finds no scene of its format{there}. Choose another reader")
     if probe.missing:
         raise DataError(f"{root}: {probe.found} lacks {probe.missing}. Copy the whole scene")
     return reader
@@ -513,20 +497,13 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
         with np.errstate(over="ignore", invalid="ignore"):
             distance = float(np.median(np.linalg.norm(points.points - middle, axis=1)))
     if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
-        fix = "move between photographs"
-        notes.append(f"all cameras are within {spread:.2g} units of one place: pure rotation gives no depth; {fix}")
+        notes.append(f"all cameras are within {spread:.2g} units of one place, without depth: move between photographs")
     off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
     if off:
-        x, y = off[0].camera.K[:2, 2]
-        place = f"{x:.0f}, {y:.0f} of {off[0].camera.width} x {off[0].camera.height} px"
-        where = f"outside the image, as in {off[0].name}: {place}; the intrinsics may be those of another size"
-        notes.append(f"the principal point of {len(off)} of {len(views)} views is {where}")
+        notes.append(f"principal points of {len(off)} views, as of {off[0].name}, are outside the image; calibrate again")
     narrow = [v for v in views if not v.camera.K[0, 0] <= MAX_FOCAL * max(v.camera.width, v.camera.height)]
     if narrow:
-        v = narrow[0]
-        of = f"{len(narrow)} of {len(views)} views is over {MAX_FOCAL} times the longer side, as {v.name}"
-        size = f"{v.camera.K[0, 0]:.0f} px at {v.camera.width} x {v.camera.height} px"
-        notes.append(f"the focal length of {of}: {size}; calibrate again")
+        notes.append(f"focal lengths of {len(narrow)} views, as of {narrow[0].name}, are over {MAX_FOCAL} sides; check them")
     # most photographs differ, and vary, in a few pixels already
     equal: dict[bytes, list[str]] = {}
     few = [v.image[::SPARSE, ::SPARSE] for v in views]
@@ -551,9 +528,7 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], option
     views, points, more = [v for v in scene.views if not options.excludes(v.name)], scene.points, scene.notes
     more = (*more, *_exclusions(options, [v.name for v in views]))
     if len(views) < 2:
-        reasons = f" ({'; '.join(more)})" if more else ""
-        few = f"{len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2"
-        raise DataError(f"{root}: the scene has {few}. Add images with cameras")
+        raise DataError(f"{root}: has {len(views)} usable views, not at least 2 ({'; '.join(more)}). Add images with cameras")
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
         more = (*more, note) if note else more

@@ -6,16 +6,14 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
-from warpgs.files import PIECE, inside, open_input, unread_reason
+from warpgs.errors import DataError, UsageError, expect, explained
+from warpgs.files import PIECE, inside, open_input
 from warpgs.geometry import CENTRAL
 from warpgs.io.image_files import MAX_PIXELS, decode_png
 from warpgs.io.images import LoadedImage, ReadOptions, turn_upright, undistortion_maps
 from warpgs.scene import GivenDepth, View
 
 SUFFIXES = (".png", ".npy")
-UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
-"""Suffixes of unsupported files that may hold maps, for a message."""
 NONE = "none"
 """Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
@@ -37,17 +35,14 @@ def map_files(folder: Path, flag: str, allow_outside: bool) -> dict[str, Path]:
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
     files: dict[str, Path] = {}
-    paths = [p for p in sorted(folder.rglob("*")) if p.name[0] != "."]
-    for file in paths:
+    for file in sorted(folder.rglob("[!.]*")):
         if file.suffix.lower() in SUFFIXES and file.is_file():
             key = file.relative_to(folder).with_suffix("").as_posix()
             if key in files:
                 raise DataError(f"{file}: {files[key].name} is for the same image; remove one of them")
             files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
     if all(key.endswith(CONFIDENCE) for key in files):
-        others = sorted({p.suffix.lower() for p in paths} & set(UNREAD))
-        found = f"it holds {' and '.join(others)} files, which are not read; convert them to" if others else "add"
-        raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
+        raise DataError(f"{folder}: holds no maps; add NPY (float32) or 16-bit PNG, named like the images")
     return files
 
 
@@ -67,12 +62,9 @@ def _find(files: dict[str, Path], image: Path) -> tuple[Path | None, Path | None
 def mapped_array(path: Path, fix: str) -> np.memmap:
     """Return the array of an NPY file, which stays in the file, for its shape and type alone; `array_numbers` reads it."""
     # numpy compares the shape with the file's size
-    try:
+    with explained(f"{path}: cannot be read as a numpy array", fix, Exception):  # numpy raises a dozen types
         open_input(path).close()
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as e:  # numpy raises a dozen types on malformed files
-        why = unread_reason(e) if isinstance(e, OSError) else f"{type(e).__name__}: {e}"
-        raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
     if not isinstance(found, np.memmap):
         found.close()
         raise DataError(f"{path}: is an archive of arrays, not one array; {fix}")
@@ -84,15 +76,14 @@ def array_numbers(path: Path, found: np.memmap, kind: type | np.dtype, fix: str)
     # a read of mapped memory ends the process (SIGBUS) if the file has become shorter, or its disk fails
     numbers = np.empty(found.shape, kind, order="C" if found.flags.c_contiguous else "F")
     flat, size, step = numbers.reshape(-1, order="A"), found.dtype.itemsize, PIECE // found.dtype.itemsize
-    try:
-        with open_input(path) as file, np.errstate(over="ignore", invalid="ignore"):
-            file.seek(found.offset)
-            for at in range(0, flat.size, step):
-                part = flat[at : at + step]
-                part[:] = np.frombuffer(file.read(part.size * size), found.dtype)
-    except (OSError, ValueError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else "it has become shorter while it was read"
-        raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
+    with explained(f"{path}: cannot be read as a numpy array", fix, (OSError, ValueError)), open_input(path) as file:
+        file.seek(found.offset)
+        for at in range(0, flat.size, step):
+            part = flat[at : at + step]
+            data = file.read(part.size * size)
+            expect(len(data) == part.size * size, "it has become shorter while it was read")
+            with np.errstate(over="ignore", invalid="ignore"):
+                part[:] = np.frombuffer(data, found.dtype)
     return numbers
 
 
@@ -108,8 +99,7 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     if found.ndim not in (2, 3) or 0 in found.shape or (found.ndim == 3 and found.shape[2] > 4):
         raise DataError(f"{path}: must be an array [height, width] or [height, width, 3], not {list(found.shape)}")
     if found.shape[0] * found.shape[1] > max_pixels:
-        fix = "shrink it, or raise --max-pixels"
-        raise DataError(f"{path}: {found.shape[1]} x {found.shape[0]} px are over {max_pixels:,}; {fix}")
+        raise DataError(f"{path}: has more than {max_pixels:,} pixels; shrink it, or raise --max-pixels")
     native = found.dtype.newbyteorder("=")
     return array_numbers(path, found, native if native in (np.uint8, np.uint16) else np.float32, "save the map alone")
 
@@ -153,8 +143,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     """
     raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
     if raw.shape != shape:
-        fix = "make both equal in size"
-        raise DataError(f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; {fix}")
+        raise DataError(f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; resize one")
     values = raw.astype(np.float32)
     if raw.dtype.kind == "u":
         values /= 2 if 0 < int(raw.max()) <= 2 else np.iinfo(raw.dtype).max
@@ -167,8 +156,7 @@ def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
     """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values."""
     raw = read_numbers(path, options.max_pixels)
     if raw.ndim != 3 or raw.shape[2] != 3:
-        shape = " x ".join(map(str, raw.shape))
-        raise DataError(f"{path}: is {shape}, normals need three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
+        raise DataError(f"{path}: is {list(raw.shape)}, not of three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
     black = (raw == 0).all(-1)
     values = raw.astype(np.float32)
     if raw.dtype.kind == "u":
@@ -181,9 +169,7 @@ def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
         raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
-        median = float(np.median(lengths[known]))
-        fix = "save PNG as (n + 1) / 2, or NPY with unit vectors"
-        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals (median length {median:.3g}); {fix}")
+        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals; save PNG as (n + 1) / 2, or NPY as it is")
     known &= np.abs(lengths - 1) <= UNIT_TOLERANCE
     normals = np.where(known[..., None], values / np.where(known, lengths, 1)[..., None], 0).astype(np.float32)
     if options.normal_axes == "opengl":
@@ -235,8 +221,7 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
             raise DataError(f"{path}: EXIF rotates its image, and normals are not rotated with it; save both upright")
         values = turn_upright(values, loaded.orientation)
     elif not _same_aspect(values.shape, (height, width)):
-        fix = "Give a map of the whole image"
-        raise DataError(f"{path}: is {columns} x {rows} px, its image {width} x {height}: the aspects differ. {fix}")
+        raise DataError(f"{path}: is {columns} x {rows} px, its image {width} x {height}; give a map of the whole image")
     final = loaded.image.shape[:2]
     if loaded.undone is not None:
         values = resized(values, width, height)
@@ -323,10 +308,7 @@ class GivenMaps:
         if not known.any():
             raise DataError(f"{path}: no pixel inside the mask has a normal; remove the file: normals are optional")
         if away > 0.5:
-            axes = self.options.normal_axes
-            other = "opencv" if axes == "opengl" else "opengl"
-            fix = f"give --normal-axes {other}, or turn them towards the camera"
-            raise DataError(f"{path}: {away:.0%} of its normals face away from the camera in {axes} axes; {fix}")
+            raise DataError(f"{path}: {away:.0%} of its normals face away from the camera; give the other --normal-axes")
         return np.where((along <= 0)[..., None], normals, 0).astype(np.float32)
 
 
@@ -337,8 +319,7 @@ def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
         having = [v for v in views if getattr(v, name) is not None]
         if path not in (None, NONE) and not having:
             names = [key for key in map_files(Path(path), flag, True) if not key.endswith(CONFIDENCE)]
-            count = f"none of its {len(names)} maps has the name of an image (the first is {names[0]!r})"
-            raise DataError(f"{path}: {count}; name each map like its image, with .png or .npy, or give another {flag}")
+            raise DataError(f"{path}: none of its {len(names)} maps, as {names[0]!r}, has the name of an image; rename them")
         if not having:
             continue
         where = f"from {Path(path)}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import DataError
-from warpgs.files import read_input, unread_reason
+from warpgs.errors import DataError, explained
+from warpgs.files import read_input
 from warpgs.geometry import matmul, pose_of
 from warpgs.io import folder as scenes
+from warpgs.io.colmap import understood
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import Lens, ReadOptions, list_images
 from warpgs.io.maps import array_numbers, mapped_array
@@ -123,15 +124,13 @@ def _lens(K: np.ndarray, where: str) -> Callable[[int, int], Lens]:
 def _read_matrices(path: Path) -> dict[str, np.ndarray]:
     """Return the world and scale matrices of the archive by name, float64, shape [4, 4] each."""
     matrices = {}
-    try:
+    with explained(f"{path}: cannot be read as an archive of arrays", "copy it again", Exception):
         with np.load(io.BytesIO(read_input(path, MAX_ARCHIVE_BYTES)), allow_pickle=False) as archive:
             for key in archive.files:
                 if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key:
                     if archive.zip.getinfo(f"{key}.npy").file_size > MAX_MATRIX_BYTES:
                         raise ValueError(f"{key} is too large for a 4 x 4 matrix")
                     matrices[key] = archive[key].astype(np.float64)
-    except Exception as e:  # numpy and zipfile raise a dozen types on malformed files
-        raise DataError(f"{path}: cannot be read as an archive of arrays ({type(e).__name__}: {e}); copy it again") from e
     for key, matrix in matrices.items():
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise DataError(f"{path}: {key} must be finite and [4, 4], not {list(matrix.shape)}. Copy the archive again")
@@ -211,7 +210,7 @@ def files_of(root: Path) -> list[Path]:
 def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera."""
     rows, count = [], None
-    try:
+    with understood(str(path), OSError):
         for number, line in enumerate(io.StringIO(read_input(path, MAX_BYTES).decode("utf-8-sig")), 1):
             if not (words := line.split()):
                 continue
@@ -222,9 +221,6 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
             if len(values) != 21 or not np.isfinite(values).all():
                 raise DataError(f"{path}, line {number}, image {words[0]!r}: needs 21 finite numbers. Copy it again")
             rows.append((number, words[0], values))
-    except (OSError, ValueError) as e:
-        fix = "needs a count, then names with 21 numbers. Copy it again"
-        raise DataError(f"{path}: cannot be understood ({unread_reason(e)}); {fix}") from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")
     return rows
@@ -253,8 +249,7 @@ class MiddleburyReader(Reader):
             where = f"{path}, line {number}, image {name!r}"
             K = _centred(values[:9].reshape(3, 3).copy(), where)
             if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
-                lower = "its lower rows are not 0 fy cy, 0 0 1"
-                raise DataError(f"{where}: K is not a matrix of intrinsics ({lower}); calibrate again")
+                raise DataError(f"{where}: K is not a matrix of intrinsics, fx 0 cx, 0 fy cy, 0 0 1; calibrate again")
             viewmat = scenes.rigid(pose_of(values[9:18].reshape(3, 3), values[18:21]), where)
             file, view = scene.child(folder, name, where), views.claim(scenes.view_name(name), where)
             mask = scene.mask_of(file, folder, folder / "masks")

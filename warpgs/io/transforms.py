@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from warpgs import schema
-from warpgs.errors import DataError
+from warpgs.errors import DataError, explained
 from warpgs.files import is_within, read_file
 from warpgs.geometry import matmul, pose_of, seen_pixels
 from warpgs.io import colmap, folder as scenes
+from warpgs.io.colmap import PARSING
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions, list_images
 from warpgs.io.maps import SUFFIXES as MAPS, NamedMaps
@@ -44,21 +45,17 @@ def files_of(root: Path) -> list[Path]:
 
 def _json(path: Path, fix: str) -> Any:
     """Return the values of a JSON file of bounded size."""
-    try:
+    with explained(f"{path}: cannot be read as JSON", fix, (ValueError, RecursionError)):
         text = read_file(path, None, MAX_BYTES, fix).decode("utf-8-sig", "surrogateescape")
         schema.check_parts(text)
         return json.loads(text)
-    except (ValueError, RecursionError) as e:
-        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}); {fix}") from e
 
 
 def read_json(path: Path) -> dict:
     """Return the parsed file with its list of frames."""
     values = _json(path, "write it again")
-    try:
+    with explained(f"{path}: is nested deeper than {MAX_DEPTH} levels", "write it again", schema.SchemaError):
         schema.check_depth(values, MAX_DEPTH)
-    except schema.SchemaError as e:  # else the error message could not name its values
-        raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels; write it again") from e
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise DataError(f"{path}: has no list 'frames'; write it again")
     return values
@@ -68,10 +65,8 @@ def _number(frame: dict, shared: dict, key: str, where: str) -> float | None:
     """Return a number of the frame, else of the file; None if both lack it, DataError if it is not finite."""
     if (value := frame.get(key, shared.get(key))) is None:
         return None
-    try:
+    with explained(f"{where}: not a number", "write it without quotes", schema.SchemaError):
         schema.number()(value, key)
-    except schema.SchemaError as e:
-        raise DataError(f"{where}: {e}; write it as a number, without quotes") from e
     return float(value)
 
 
@@ -81,8 +76,7 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
     if model not in known:
-        fix = f"Undistort the images first{kept if model == FISHEYE else ''}"
-        raise DataError(f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(known)}). {fix}")
+        raise DataError(f"{where}: camera model {model[:40]} is not supported. Undistort the images{kept * (model == FISHEYE)}")
     fisheye = native and bool(model == FISHEYE or frame.get("is_fisheye", shared.get("is_fisheye")))
     number = partial(_number, frame, shared, where=where)
     width, height = (own if (given := number(key)) is None else int(given) for key, own in (("w", width), ("h", height)))
@@ -96,11 +90,10 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
         f.append(focal)
         c.append(side / 2 if center is None else center)
     distortion = [number(k) or 0.0 for k in (("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3"))]
-    unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
-    other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
+    unread = ("k5", "k6", "fisheye_crop_radius", "p1", "p2") if fisheye else UNSUPPORTED_TERMS
+    other = [k for k in unread if frame.get(k, shared.get(k))]
     if other:
-        why = "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, not supported here"
-        raise DataError(f"{where}: {other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
+        raise DataError(f"{where}: {other[0]} is not supported here. Undistort the images{kept * (other[0] == 'is_fisheye')}")
     fx = f[0] if f[0] is not None else f[1]
     if fx is None:
         raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown; add one of them")
@@ -111,12 +104,10 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
 
 def matrix_of(frame: dict, where: str) -> np.ndarray:
     """Return the transform_matrix of a frame, shape [3, 4] or [4, 4]."""
-    try:
+    with explained(f"{where}: transform_matrix is missing or not made of rows of numbers", "correct it", PARSING):
         # through object, so that ragged rows and huge integers are caught here and strings are not parsed
         rows = [[float(x) if not isinstance(x, (str, bool)) else math.nan for x in row] for row in frame["transform_matrix"]]
         matrix = np.array(rows, np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError) as e:
-        raise DataError(f"{where}: transform_matrix is missing or not made of rows of numbers; write the file again") from e
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{where}: transform_matrix must be [4, 4], not {list(matrix.shape)}; write the file again")
     return matrix
@@ -359,14 +350,12 @@ def _inria(path: Path, rows: list[Any]) -> Iterator[Row]:
     """Yield the cameras of rows with a camera-to-world rotation in OpenCV axes and the camera centre."""
     for i, row in enumerate(rows):
         where = f"{path}, camera {i}"
-        try:
+        with explained(f"{where}: needs rotation, position, width, height, fx and fy as numbers", "correct it", PARSING):
             rotation, position = np.array(row["rotation"], np.float64), np.array(row["position"], np.float64)
             pose = pose_of(rotation.reshape(3, 3), position.reshape(3))
             width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
             lens = Lens(np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), int(width), int(height))
             name, origin = str(row.get("img_name", i)), checked_origin(row.get(ORIGIN, (0, 0, 0)), where)
-        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
-            raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
         yield name, scenes.about(scenes.from_camera_to_world(pose, where, opengl=False), origin), lens.checked(where)
 
 
@@ -376,14 +365,11 @@ def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
         raise DataError(f"{path}: camera_type is {str(kind)[:40]}, but renders are pinholes; export a perspective path")
     for i, frame in enumerate(values["camera_path"]):
         where = f"{path}, camera_path {i}"
-        try:
+        with explained(f"{where}: needs camera_to_world, fov, render_width and render_height", "export it again", PARSING):
             pose = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
             width, height, fov = int(values["render_width"]), int(values["render_height"]), float(frame["fov"])
             if not 0 < fov < 180:
                 raise ValueError("fov")
-        except (KeyError, TypeError, ValueError, OverflowError) as e:
-            needs = "camera_to_world (16 numbers), fov, and render_width and render_height of the file"
-            raise DataError(f"{where}: needs {needs}; export the path again") from e
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov))
         lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
         yield f"{i:05d}", scenes.from_camera_to_world(pose, where, opengl=True), lens.checked(where)

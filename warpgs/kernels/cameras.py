@@ -66,11 +66,9 @@ def check_camera(camera: Camera) -> type[CameraModel]:
     model = CAMERA_MODELS.find(camera.model)
     found = 0 if camera.distortion is None else camera.distortion.shape[-1]
     if found and not model.coefficients:
-        others = ', or give model="opencv" (8) or model="fisheye" (4)' if camera.model == "pinhole" else ""
-        raise UsageError(f"the camera model {camera.model!r} takes no distortion, found {found} coefficients; omit it{others}")
+        raise UsageError(f"the camera model {camera.model!r} takes no distortion; give model opencv (8) or fisheye (4)")
     if found != model.coefficients:
-        takes = f"{camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}"
-        raise UsageError(f"the camera model {takes}; give Camera.distortion the shape [P] or [C, P], zeros for none")
+        raise UsageError(f"{camera.model!r} takes {model.coefficients} coefficients of distortion, not {found}; 0 for none")
     if getattr(camera.distortion, "requires_grad", False):
         raise UsageError("gradients of distortion coefficients are not supported: give Camera.distortion.detach()")
     return model

@@ -57,6 +57,8 @@ def check_device(name: str, tensor: torch.Tensor) -> None:
         raise ValueError(f"{name} is on {tensor.device}, but the kernels run on cpu and cuda only; .to('cpu') moves it")
     if type(tensor) is not torch.Tensor and isinstance(tensor, FakeTensor):
         raise ValueError(f"{name} is a fake tensor, without memory; leave FakeTensorMode before the call")
+    if tensor.layout != torch.strided:
+        raise TypeError(f"{name} must be dense, not {tensor.layout}; {name}.to_dense() converts it")
 
 
 def is_native(tensor: torch.Tensor) -> bool:
@@ -414,11 +416,9 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     for name, (tensor, pattern) in tensors.items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
-        if tensor.layout != torch.strided:
-            raise TypeError(f"{name} must be dense, not {tensor.layout}; {name}.to_dense() converts it")
+        check_device(name, tensor)
         if first is None:
             first_name, first = name, tensor
-            check_device(name, tensor)
             if tensor.dtype not in REALS:
                 levels = " / 255" * (tensor.dtype == torch.uint8)  # of an 8-bit image
                 raise TypeError(f"{name} must be float32 or float64, not {tensor.dtype}; {name}.float(){levels} converts it")
@@ -467,14 +467,10 @@ def kept(ctx: Any) -> tuple[Any, ...]:
     for tensor, place in zip(tensors, ctx.places, strict=True):
         if tensor is None:
             continue
-        shape, dtype, device, address = place
-        now = tensor.shape, tensor.dtype, tensor.device
-        if now != (shape, dtype, device) or (address is not None and tensor.data_ptr() != address):
-            before, after = (f"{list(s)} {t} on {d}" for s, t, d in ((shape, dtype, device), now))
-            raise RuntimeError(
-                f"the .data of a tensor was replaced between the forward and the backward pass ({before}, now {after}): "
-                "replace it after the backward pass, or render again"
-            )
+        *before, address = place
+        now = [tensor.shape, tensor.dtype, tensor.device]
+        if now != before or (address is not None and tensor.data_ptr() != address):
+            raise RuntimeError(f"a .data was replaced between forward and backward pass ({before}, now {now}): render again")
     return tuple(tensors)
 
 
@@ -505,10 +501,7 @@ def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> t
 def refuse_transforms() -> None:
     """Raise UsageError within a transform of torch.func."""
     if torch._C._are_functorch_transforms_active():
-        raise UsageError(
-            "rasterize does not support torch.func (grad, vmap, jacrev, jvp): use torch.autograd.grad or backward() for "
-            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] instead of vmap"
-        )
+        raise UsageError("rasterize does not support torch.func: use torch.autograd.grad, or a batch of cameras for vmap")
 
 
 @functools.lru_cache(maxsize=64)

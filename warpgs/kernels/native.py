@@ -18,7 +18,7 @@ from filelock import lock_descriptor, unlock_descriptor
 
 from warpgs.clock import section
 from warpgs.device import REMEDY, usable_cores
-from warpgs.errors import ResourceError
+from warpgs.errors import ResourceError, explained
 from warpgs.files import make_folder
 from warpgs.process import Say, say
 
@@ -297,10 +297,8 @@ def exclusive(path: Path) -> Iterator[None]:
     """Lock a file, which is made if missing, so that one thread of one process at a time runs the body."""
     # The system releases the lock when its process ends, even if killed. On a file system without locks the body runs unlocked:
     # Warp renames a compiled module into place, so two processes that compile it only lose time.
-    try:
+    with explained(f"{path}: cannot be opened", REMEDY, kind=ResourceError):
         file = path.open("ab")
-    except OSError as e:
-        raise ResourceError(f"{path}: cannot be opened ({e.strerror or e}). {REMEDY}") from e
     with file, contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
             lock_descriptor(file.fileno())

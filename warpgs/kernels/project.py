@@ -1,6 +1,5 @@
 """Projection of 3D Gaussians to ellipses in the image: activations, EWA covariance and its factor, colour, tile counts."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -118,8 +117,7 @@ def project_inputs(inputs: ProjectInputs, settings: Pass) -> tuple[torch.Tensor,
         distortion=(inputs.distortion, f"C {model.coefficients}"),
     )  # fmt: skip
     if sizes["K"] < settings.sh_count:
-        degree = math.isqrt(settings.sh_count) - 1
-        raise ValueError(f"sh has {sizes['K']} coefficients per channel, but degree {degree} needs {settings.sh_count}")
+        raise ValueError(f"sh has {sizes['K']} coefficients per channel, but the degree needs {settings.sh_count}")
     width, height = settings.size
     if width < 1 or height < 1:
         raise ValueError(f"the image must be at least 1 x 1 px, not {width} x {height}")

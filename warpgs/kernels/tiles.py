@@ -502,7 +502,7 @@ def step_bytes(sizes: StepSizes) -> Needs:
     return {BINNING: ranges + sorting + lists, LOSS: waiting, BLENDING: ranges + kept, SAMPLING: ranges + lists}
 
 
-def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
+def _check_total(total: int, device: torch.device, budget_bytes: int | None) -> None:
     """Raise ResourceError where the instances exceed the budget, or the number that kernels can index."""
     needed = total * BYTES_PER_INSTANCE
     countable = total <= MAX_INSTANCES
@@ -510,11 +510,8 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     if countable and needed <= budget:
         return
     limit = format_bytes(budget) if countable else f"{MAX_INSTANCES:,} instances"
-    raise ResourceError(
-        f"{visible:,} visible Gaussians touch {total / max(visible, 1):.0f} of {tiles} tiles on average; their {total:,} "
-        f"(Gaussian, tile) instances need {format_bytes(needed)}, and the limit is {limit}. Many Gaussians are probably far "
-        "too large: check their scales, or render smaller images, fewer cameras at once, or raise the memory budget."
-    )
+    needs = f"{total:,} (Gaussian, tile) instances need {format_bytes(needed)}, and the limit is {limit}"
+    raise ResourceError(f"{needs}. Check the Gaussians' scales, render smaller images, or raise the memory budget")
 
 
 def _depth_order(projected: Tensor, counts: Tensor, tiles: int, memory: InstanceMemory) -> tuple[Tensor, int, int]:
@@ -530,12 +527,11 @@ def _depth_order(projected: Tensor, counts: Tensor, tiles: int, memory: Instance
             packed, visible = memory.visible
     else:
         if not sums_fit(count, tiles):
-            many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
-            _check_total(*reversed(many.tolist()), device, tiles, memory.budget)
+            _check_total(int(counts.sum(dtype=torch.int64)), device, memory.budget)
         # One read from the device, before the sorts, returns the numbers of visible Gaussians and of touched tiles.
         packed = running_counts(counts, real, memory.allocator)
         visible, total = split_sum(int(packed[-1]), count)
-        _check_total(total, visible, device, tiles, memory.budget)
+        _check_total(total, device, memory.budget)
     depths, order = (memory.allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
     if packed is None:
         launch.launch(k.depth_keys, count, [projected, counts, depths, order], device)
@@ -558,8 +554,7 @@ def bin_tiles(
     columns, rows = grid(width, height, tile_size)
     no_tile = cameras * columns * rows
     if no_tile > launch.MAX_SIZE:
-        images = f"{cameras:,} images of {width} x {height} px have {no_tile:,} tiles, and kernels index {launch.MAX_SIZE:,}"
-        raise ResourceError(f"{images}; render fewer cameras at once, or a window of each image")
+        raise ResourceError(f"{cameras:,} images of {width} x {height} px have too many tiles; render fewer at once")
     counts = tile_counts.contiguous().view(-1)
     device, real, native, allocator = projected.device, launch.real_of(projected), projected.is_cuda, memory.allocator
     ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()

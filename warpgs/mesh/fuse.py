@@ -114,10 +114,8 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
     if plan.points > MAX_SIZE:
         raise ResourceError(f"a grid of {sizes} points is beyond the {MAX_SIZE:,} that kernels can index; {remedy}")
     for where, needed in needs.items():
-        free = available_bytes(where)
-        if needed > 0.8 * free:
-            most = f"{format_bytes(needed)} of memory on {where}, more than 80 % of the free {format_bytes(free)}"
-            raise ResourceError(f"a grid of {sizes} points takes {most}; {remedy}")
+        if needed > 0.8 * (free := available_bytes(where)):
+            raise ResourceError(f"a grid of {sizes} points takes {format_bytes(needed)} of {format_bytes(free)} free; {remedy}")
     return format_bytes(sum(needs.values()))
 
 

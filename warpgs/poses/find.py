@@ -1,5 +1,6 @@
 """`find_poses`: photographs become a scene folder, with a record of how, and advice where it fails."""
 
+import contextlib
 import hashlib
 import math
 import shutil
@@ -11,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from warpgs import files, schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, explained
 from warpgs.io.folder import all_readers, loaders
 from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses import photographs as photos
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
 from warpgs.poses.matching import Matcher, write_matches
-from warpgs.process import Say, silent
+from warpgs.process import Say, counted, silent
 
 MIN_KEYPOINTS = 100
 """Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
@@ -69,10 +70,8 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
         links = [(n, i, j) for i in group for j, n in found.links[i] if j in found.views]
         _, i, j = max(links, default=(0, group[0], -1))
         way = f"between {names[i]} and {names[j]}" if links else f"from {names[i]} to the photographs outside its group"
-        said.append(
-            f"take photographs {way}, each overlapping the previous one by two thirds: {len(group)} photographs form a "
-            f"separate group, {names[group[0]]} to {names[group[-1]]}"
-        )
+        apart = f"{len(group)} form a separate group, {names[group[0]]} to {names[group[-1]]}"
+        said.append(f"take photographs {way}, each overlapping the previous one by two thirds: {apart}")
     for i in sorted(lost.difference(*groups)):
         # pairs that match well need no photograph between
         weak = [names[j] for j, n in found.links[i] if n < WEAK_MATCHES and j in found.views]
@@ -84,8 +83,7 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
             said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
     for i, j, angle in sorted(neighbours(found), key=lambda t: -t[2]):
         if angle > WIDE_ANGLE and dict(found.links[i]).get(j, 0) < WEAK_MATCHES:
-            pair = f"{names[i]} and {names[j]}"
-            said.append(f"take one or two photographs between {pair}, whose axes differ by {angle:.0f} degrees")
+            said.append(f"take one or two photographs between {names[i]} and {names[j]}, {angle:.0f} degrees apart")
     for i in found.views:
         j, n = next((link for link in found.links[i] if link[0] in found.views), (i, WEAK_MATCHES))
         if n < WEAK_MATCHES:
@@ -139,22 +137,15 @@ def record_of(found: Mapping, photographs: Sequence[photos.Photograph], digest: 
         })  # fmt: skip
     focal = ", ".join(f"{c['focal']:.0f} px of {max(c['width'], c['height'])}" for c in found.cameras)
     count = f"{len(found.views)} photographs"
-    remarks = [
-        f"poses found for {len(found.views)} of {len(names)} photographs from {found.points:,} points, mean reprojection error "
-        f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
-    ]
+    estimate = f"an estimate from {count} is often 5 % off, at worst 20 % or more"
+    how = f"{found.points:,} points, mean reprojection error {found.error:.2f} px, {found.method} mapping, focal length {focal}"
+    remarks = [f"poses found for {len(found.views)} of {len(names)} photographs: {how}"]
     if found.kept_focal:
         remarks.append(f"the focal length is taken from EXIF, because {count} cannot improve it")
     elif found.kept_focal is False:
-        remarks.append(
-            f"the EXIF focal length does not fit the {count}, which may be cropped; the focal length was estimated instead. "
-            "Such an estimate is often 5 % off, at worst 20 % or more"
-        )
+        remarks.append(f"the EXIF focal length does not fit the {count}, which may be cropped; {estimate}")
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
-        remarks.append(
-            f"EXIF holds no focal length. An estimate from {count} is often 5 % off, at worst 20 % or more, and so is depth. "
-            "Add photographs from more directions"
-        )
+        remarks.append(f"EXIF holds no focal length; {estimate}, and so is depth. Add photographs from more directions")
     for c in found.cameras:
         width, height, times = c["width"], c["height"], c["focal"] / max(c["width"], c["height"])
         if not USUAL[0] < times < USUAL[1]:
@@ -186,10 +177,8 @@ def report_lines(record: dict[str, Any]) -> list[str]:
 def read_poses_record(folder: Path) -> dict[str, Any]:
     """Read poses.json of a scene whose poses were found."""
     path = folder / JSON
-    try:
+    with explained(f"{path}: cannot be read", "find the poses again with `warpgs poses`", (OSError, schema.SchemaError)):
         return schema.read(path, folder, _RECORD)
-    except (OSError, schema.SchemaError) as e:
-        raise DataError(f"{path}: cannot be read ({e}); find the poses again with `warpgs poses`") from e
 
 
 MIN_PHOTOGRAPHS = 3
@@ -202,12 +191,11 @@ MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.
 
 def needs_poses(path: Path) -> bool:
     """Return whether a path is a video, or a folder of images that holds no scene format."""
-    try:
+    with contextlib.suppress(OSError):  # the scene reader reports the error
         if photos.is_video(path):
             return True
         return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(photos.find_photographs(path)[0])
-    except OSError:  # the scene reader reports the error
-        return False
+    return False
 
 
 def source_digest(source: Path, allow_outside: bool = False) -> str:
@@ -248,8 +236,7 @@ def find_poses(
             notes += more
         _check_found(source, found, photographs)
         record = record_of(found, photographs, digest, notes) | {"source": source.resolve().name}
-        for done, i in enumerate(found.views):
-            progress(f"writing images: {done + 1} of {len(found.views)}")
+        for i in counted(tuple(found.views), progress, "writing images", "photographs"):
             photos.write_copy(photographs[i], scene / "images", max_pixels)
         files.make_folder(scene / "sparse" / "0")
         for name in MODEL_FILES:
@@ -291,8 +278,7 @@ def _something_else(folder: Path) -> str:
     probes = {d.name: [p for r in all_readers() if (p := r.probe(d))] for d in sorted(folder.iterdir()) if d.is_dir()}
     scenes = [name for name, found in probes.items() if found]
     if model := next((m for m in photos.models_below(folder) if all(p.missing for p in probes[m.parts[0]])), None):
-        use = f"`warpgs fit {folder} --reconstruction {model.as_posix()}` uses its poses; move it away to find new ones"
-        return f"holds a COLMAP reconstruction in {model.as_posix()}: {use}"
+        return f"holds poses: use `warpgs fit {folder} --reconstruction {model.as_posix()}`, or move them away to find new ones"
     if scenes:
         return f"holds scenes, such as {scenes[0]}; give one scene, or only photographs, or use `warpgs farm` for all"
     return ""
@@ -300,12 +286,11 @@ def _something_else(folder: Path) -> str:
 
 def _check(source: Path, out: Path, allow_outside: bool) -> None:
     """Raise an error for an unusable source or target, before any work."""
-    try:
+    with explained(f"{source} or {out}: cannot be read", "choose other folders", kind=UsageError):
         if not photos.is_video(source):
             if not source.is_dir():
-                there = files.NOT_REGULAR if source.exists() else "does not exist"
-                what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
-                raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
+                what = "is neither" if source.exists() else "does not exist"
+                raise DataError(f"{source}: {what}; give a folder of photographs, or a video (mp4, mov, m4v, avi, mkv, webm)")
             if other := _something_else(source):
                 raise UsageError(f"{source}: {other}")
             if not photos.photographs_inside(source, allow_outside):
@@ -313,8 +298,6 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
                 raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and files.is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
-    except OSError as e:
-        raise UsageError(f"{e.filename or out}: cannot be read ({e.strerror or e}); choose another folder") from e
 
 
 def _prepared(
@@ -335,10 +318,8 @@ def _prepared(
         notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:
         what = "frame" if photos.is_video(source) else "photograph"
-        raise DataError(
-            f"{source}: has {len(paths)} {what}{'s' if len(paths) != 1 else ''}; poses need at least {MIN_PHOTOGRAPHS}, "
-            f"better 8 to 20 that overlap by two thirds{'; left out: ' + unread if unread else ''}"
-        )
+        few = f"{len(paths)} {what}{'s' if len(paths) != 1 else ''}{'; left out: ' + unread if unread else ''}"
+        raise DataError(f"{source}: has {few}; poses need at least {MIN_PHOTOGRAPHS}, better 8 to 20 that overlap")
     photographs, names = [], [f"{i:06d}.png" for i in range(len(paths))]
     if copies := photos.to_jpeg([p for p in paths if photos.is_heic(p)], root, work / "heic", max_pixels, progress):
         notes.append(f"{len(copies)} HEIC photograph{'s' if len(copies) != 1 else ''} converted to JPEG")
@@ -376,17 +357,10 @@ def _check_found(source: Path, found: Mapping, photographs: list[photos.Photogra
         return
     count, blank = len(photographs), sum(k < MIN_KEYPOINTS for k in found.keypoints)
     if 2 * blank >= count:
-        why = (
-            f"{blank} of {count} photographs show almost nothing that can be matched (fewer than {MIN_KEYPOINTS} keypoints; "
-            f"the best one has {max(found.keypoints):,}): a blank wall, darkness or blur. Take sharp photographs of textured "
-            "things, in good light"
-        )
+        why = f"{blank} of {count} photographs have fewer than {MIN_KEYPOINTS} keypoints: is it a blank wall? Take other ones"
     elif not max(found.matches.values(), default=0):
         why = f"no two of {count} photographs could be matched. Take photographs that overlap by two thirds, in small steps"
     else:
-        why = (
-            f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "
-            "photographs that overlap by two thirds, moving the camera, not only turning it. "
-            f"First, {advice(found, [p.name for p in photographs])[0]}"
-        )
+        few = f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed"
+        why = f"{few}. Move the camera, do not only turn it. First, {advice(found, [p.name for p in photographs])[0]}"
     raise DataError(f"{source}: no poses: {why}")

@@ -293,11 +293,9 @@ def matched(pycolmap: Any, job: Json, tried: int) -> Json:
         keypoints = [database.num_keypoints_for_image(i) for i in order]
         ids, geometries = database.read_two_view_geometries()
     index = {number: i for i, number in enumerate(order)}
-    agreed = []
-    for pair, geometry in zip(ids, geometries, strict=True):
-        i, j = sorted(index[k] for k in pycolmap.pair_id_to_image_pair(pair))
-        agreed.append([i, j, len(geometry.inlier_matches)])
-    return {"keypoints": keypoints, "pairs": sorted(agreed), "tried": tried}
+    pairs = [sorted(index[k] for k in pycolmap.pair_id_to_image_pair(pair)) for pair in ids]
+    agreed = sorted([*pair, len(g.inlier_matches)] for pair, g in zip(pairs, geometries, strict=True))
+    return {"keypoints": keypoints, "pairs": agreed, "tried": tried}
 
 
 def map_incrementally(pycolmap: Any, job: Json, keep_focal: bool = False) -> list[Any]:

@@ -9,7 +9,7 @@ from warpgs.errors import DataError
 from warpgs.files import replacing
 from warpgs.io.image_files import decode_png
 from warpgs.onnx import Model, fixed_size
-from warpgs.process import Say
+from warpgs.process import Say, counted
 
 # Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
 #
@@ -182,10 +182,7 @@ def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequenc
 
 def write_matches(matcher: Matcher, images: Sequence[Path], out: Path, kind: str, exhaustive: int, progress: Say) -> list[int]:
     """Write keypoints and matches of photographs for the worker; return the indices of the photographs that it rotated."""
-    found = []
-    for i, image in enumerate(images):
-        progress(f"finding features: photograph {i + 1} of {len(images)}")
-        found.append(matcher.features(decode_png(image)))
+    found = [matcher.features(decode_png(image)) for image in counted(images, progress, "finding features", "photographs")]
     pairs = [(i, j) for j in range(len(found)) for i in range(j)]
     if len(found) > exhaustive:
         pairs = choose_pairs([(d // 16 + 128).astype(np.uint8) for _, d in found], kind)
@@ -196,10 +193,7 @@ def write_matches(matcher: Matcher, images: Sequence[Path], out: Path, kind: str
         turned = [i for i, t in enumerate(turns) if t]
         for i in turned:
             found[i] = matcher.features(decode_png(images[i]), turns[i])
-    matches = []
-    for k, (i, j) in enumerate(pairs):
-        progress(f"matching: pair {k + 1} of {len(pairs)}")
-        matches.append(mutual_matches(found[i][1], found[j][1]))
+    matches = [mutual_matches(found[i][1], found[j][1]) for i, j in counted(pairs, progress, "matching", "pairs")]
     with replacing(out) as (file, _):
         np.savez(
             file, keypoints=np.concatenate([p for p, _ in found]), per_photograph=np.array([len(p) for p, _ in found]),

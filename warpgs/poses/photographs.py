@@ -1,5 +1,6 @@
 """Photographs and videos that poses are found for: which they are, and their copies as images."""
 
+import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -15,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, install_extras, listed
-from warpgs.files import UNDECODABLE, inside, make_folder, read_start, unread_reason, write_bytes, write_json
+from warpgs.errors import DataError, UsageError, explained, install_extras, listed
+from warpgs.files import UNDECODABLE, inside, make_folder, read_start, write_bytes, write_json
 from warpgs.io import image_files
 from warpgs.io.images import list_images, turn_upright
 from warpgs.process import ProcessFailed, Say, answer, end_with_parent, hidden_stderr, python_lines, silent, utf8_name
@@ -88,10 +89,8 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
 
 def _check_container(path: Path) -> None:
     """Raise a DataError if a file is not a video container: FFmpeg would follow a playlist to other files."""
-    try:
+    with explained(f"{path}: the video cannot be read", "fix its permissions or copy it again"):
         start = read_start(path, START)
-    except OSError as e:
-        raise DataError(f"{path}: the video cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
     avi, matroska = start[:4] == b"RIFF" and start[8:] == b"AVI ", start[:4] == b"\x1a\x45\xdf\xa3"
     if not (avi or matroska or start[4:8] in BOXES):
         raise DataError(f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames")
@@ -298,10 +297,9 @@ def scene_name(name: str, data: bytes) -> str:
 
 
 def _format(data: bytes) -> str:
-    try:
+    with contextlib.suppress(ValueError):
         return image_files.format_of(data)
-    except ValueError:
-        return ""
+    return ""
 
 
 def prepare(path: Path, root: Path, small: Path, max_pixels: int = image_files.MAX_PIXELS) -> Photograph:
@@ -336,10 +334,8 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = image_fil
     if photograph.orientation == 1 and kind in ("JPEG", "PNG"):
         write_bytes(target, without_jpeg_metadata(data) if kind == "JPEG" else without_png_metadata(data))
         return
-    colors, alpha = (
-        None if a is None else turn_upright(a, photograph.orientation)
-        for a in image_files.decode(photograph.path, max_pixels, data)
-    )
+    stored = image_files.decode(photograph.path, max_pixels, data)
+    colors, alpha = (None if a is None else turn_upright(a, photograph.orientation) for a in stored)
     assert colors is not None
     pixels = colors[..., ::-1] if alpha is None else np.concatenate([colors[..., ::-1], alpha[..., None]], -1)
     suffix, options = (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]) if kind == "JPEG" else (".png", [])

@@ -8,6 +8,7 @@ import logging
 import shlex
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpgs.errors import DataError, ResourceError, UsageError, install_extras
+from warpgs.errors import DataError, ResourceError, UsageError, explained, install_extras
 from warpgs.files import read_file, read_input, remove_leftovers, write_bytes, write_text
 from warpgs.folders import temporary_folder
 from warpgs.onnx import check_onnx, start_session
@@ -28,15 +29,14 @@ REMEDY = install_extras("export")
 
 def onnx_bytes(network: torch.nn.Module, image: Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None) -> bytes:
     """Return the ONNX file of a network for an ``image`` [1, 3, h, w]; ``sizes`` are the sizes that its axes may have."""
-    try:
+    with explained("onnxscript, which writes ONNX for torch, is not installed", REMEDY, ImportError, ResourceError):
         import onnxscript  # noqa: F401
-    except ImportError as e:
-        raise ResourceError(f"onnxscript, which writes ONNX for torch, is not installed; {REMEDY}") from e
     exporter = logging.getLogger("torch.onnx")
     before = exporter.level
     exporter.setLevel(logging.ERROR)
+    full = explained("temporary files cannot be written", "free disk space, or set TMPDIR", kind=ResourceError)
     try:
-        with temporary_folder() as folder, warnings.catch_warnings():
+        with full, temporary_folder() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             path = folder.path / "network.onnx"
             torch.onnx.export(
@@ -44,8 +44,6 @@ def onnx_bytes(network: torch.nn.Module, image: Tensor, outputs: Sequence[str], 
                 dynamic_shapes=None if sizes is None else (sizes,), dynamo=True, external_data=False, verbose=False,
             )  # fmt: skip
             return path.read_bytes()
-    except OSError as e:
-        raise ResourceError(f"temporary files cannot be written ({e.strerror or e}); free disk space, or set TMPDIR") from e
     finally:
         exporter.setLevel(before)
 
@@ -177,8 +175,7 @@ def export_matcher(out: Path) -> list[str]:
     remove_leftovers(out.parent)
     write_bytes(out, data)
     return [
-        f"{out}: xfeat, images of 96 to {32 * LARGEST} px, {out.stat().st_size / 2**20:.1f} MiB; onnxruntime finds {same:.1%} "
-        "of torch's keypoints",
+        f"{out}: xfeat, images of 96 to {32 * LARGEST} px; onnxruntime finds {same:.1%} of torch's keypoints",
         f"next: warpgs poses PHOTOGRAPHS --matcher {shlex.quote(str(out))} --out scene",
     ]
 
@@ -233,11 +230,8 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
         )  # fmt: skip
         return _OneOutput(DPTForDepthEstimation(config), "predicted_depth")
     name = request.weights or DPT_WEIGHTS
-    try:
+    with explained(f"{name}: not loaded", "give a folder of weights with --weights", (OSError, ValueError)):
         return _OneOutput(DPTForDepthEstimation.from_pretrained(name, use_safetensors=True), "predicted_depth")
-    except (OSError, ValueError) as e:
-        why = f"the weights cannot be loaded ({str(e).splitlines()[0][:200]})"
-        raise DataError(f"{name}: {why}; connect to the internet to download them, or name their folder with --weights") from e
 
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
@@ -266,29 +260,24 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
             return grow(total, pixel_values.shape[-2:])
 
     network = FCN()
-    try:
+    with _loading(request.weights, RuntimeError):
         network.load_state_dict(network.state_dict() if given is None else given)
-    except RuntimeError as e:
-        raise _no_weights(request.weights, e) from e
     return network
 
 
 def _own_weights(path: str | None) -> dict[str, Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if path is None:
-        fix = "give your own with --weights FILE.safetensors, or export fcn-resnet50, for which torchvision has weights"
-        raise UsageError(f"fcn-resnet18: no public weights for the 21 VOC classes are known; {fix}")
+        raise UsageError("fcn-resnet18 has no public weights: give --weights FILE.safetensors, or export fcn-resnet50")
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    try:
+    with _loading(path, (OSError, SafetensorError)):
         return load(read_input(path))
-    except (OSError, SafetensorError) as e:
-        raise _no_weights(path, e) from e
 
 
-def _no_weights(path: str | None, error: Exception) -> DataError:
-    return DataError(f"{path}: these are not weights of fcn-resnet18 ({str(error).splitlines()[0][:200]})")
+def _loading(path: str | None, errors: Any) -> AbstractContextManager[None]:
+    return explained(f"{path}: these are not weights of fcn-resnet18", "give others with --weights", errors)
 
 
 def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
@@ -313,12 +302,10 @@ class _OneOutput(torch.nn.Module):
 def build(request: ExportRequest) -> torch.nn.Module:
     """Return the network in torch, ready for inference: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w]."""
     makers = {"dpt": _dpt, "fcn-resnet18": _fcn_resnet18, "fcn-resnet50": _fcn_resnet50}
-    try:
+    with explained(f"{request.model}: the export needs another package", REMEDY, ImportError, kind=ResourceError):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             return makers[request.model](request).eval()
-    except ImportError as e:
-        raise ResourceError(f"{request.model}: the export needs {e.name or e}; {REMEDY}") from e
 
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:
@@ -346,7 +333,6 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     flag = "--depth-model" if is_depth else "--segmentation-model"
     trained = "small and untrained, for tests only; " if request.random_weights else ""
     return [
-        f"{out}: {request.model}, {request.size} x {request.size} px, {out.stat().st_size / 2**20:.1f} MiB; "
-        f"{trained}onnxruntime and torch agree to {difference:.1e} standard deviations",
+        f"{out}: {request.size} x {request.size} px; {trained}onnxruntime agrees to {difference:.1e} standard deviations",
         f"next: warpgs priors show SCENE {flag} {out} --out priors",
     ]

@@ -329,8 +329,7 @@ def flo_names(views: Sequence[View], i: int, j: int) -> list[str]:
 def _from_folder(folder: Path, views: Sequence[View]) -> FlowBetween:
     names = itertools.chain.from_iterable(flo_names(views, *p) for p in itertools.permutations(range(len(views)), 2))
     if not any((folder / n).is_file() for n in names):
-        example = f" (such as {flo_names(views, 0, 1)[0]} or {flo_names(views, 0, 1)[1]})" if len(views) > 1 else ""
-        raise DataError(f"{folder}: no .flo file of two training views{example}; give the folder that holds them")
+        raise DataError(f"{folder}: no .flo files, such as {flo_names(views, 0, len(views) - 1)[0]}; give their folder")
 
     def between(i: int, j: int) -> np.ndarray | None:
         for name in flo_names(views, i, j):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warpgs import geometry
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, listed
 from warpgs.priors.flow import nearest_views, no_depth, pixel_grid
 from warpgs.scene import Camera, GivenDepth, PointCloud, View, ViewDepth
 
@@ -132,8 +132,8 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     return Alignment(scale, shift, count, float(np.median(off)), why_not)
 
 
-def votes(views: Sequence[View], depths: Sequence[np.ndarray], index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count the other views that confirm each depth of a view, and that see through it, int [H, W] each."""
+def votes(views: Sequence[View], depths: Sequence[np.ndarray], index: int) -> np.ndarray:
+    """Count the other views that confirm each depth of a view, and that see through it, int [2, H, W]."""
     own = depths[index]
     step = math.ceil(math.sqrt(np.count_nonzero(own) / MAX_POINTS)) if own.any() else 1
     coarse = own[::step, ::step]
@@ -148,8 +148,7 @@ def votes(views: Sequence[View], depths: Sequence[np.ndarray], index: int) -> tu
         at = rows[seen], columns[seen]
         counts[0][at] += known & (np.abs(there - other) <= NEAR * other)
         counts[1][at] += known & (there < (1 - NEAR) * other)
-    confirm, through = counts.repeat(step, 1).repeat(step, 2)[:, : own.shape[0], : own.shape[1]]
-    return confirm, through
+    return counts.repeat(step, 1).repeat(step, 2)[:, : own.shape[0], : own.shape[1]]
 
 
 def with_given_depth(
@@ -160,10 +159,8 @@ def with_given_depth(
     # confirms it and the estimate is missing or differs. Depths that more views see through than confirm are dropped.
     before = [no_depth(v) for v in views] if found is None else list(found)
     made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
-    given = [
-        a.depth(v.depth) if v.depth is not None and a is not None and not a.why_not else np.zeros(v.image.shape[:2], np.float32)
-        for v, a in zip(views, made, strict=True)
-    ]
+    none = [np.zeros(v.image.shape[:2], np.float32) for v in views]
+    given = [zeros if a is None or a.why_not else a.depth(v.depth) for v, a, zeros in zip(views, made, none, strict=True)]
     refused = [f"{v.name}: {a.why_not}" for v, a in zip(views, made, strict=True) if a is not None and a.why_not]
     if len(refused) == sum(a is not None for a in made):
         remedy = "Check --depth-kind, start from a sweep (--init.source sweep), or leave out --depths"
@@ -197,18 +194,14 @@ def _notes(made: Sequence[Alignment | None], refused: Sequence[str], removed: fl
     words = [f"given depth: used in {len(used)} of {len(made)} views"]
     if compared:
         off = [a.difference for a in compared]
-        words.append(
-            f"median difference from depths that other views confirm: {np.median(off):.1%} (worst view {max(off):.1%}), at "
-            f"{sum(a.references for a in compared):,} pixels"
-        )
+        words.append(f"median difference from depths of other views: {np.median(off):.1%} (worst view {max(off):.1%})")
     if len(compared) < len(used):
         words.append(f"{len(used) - len(compared)} of these views without a comparison")
     if removed:
         words.append(f"{removed:.1%} of the given depths left out, because other views see through them")
     notes = ["; ".join(words)]
     if refused:
-        shown = "; ".join(refused[:SHOWN]) + (" ..." if len(refused) > SHOWN else "")
-        notes.append(f"given depth: {len(refused)} maps are not used: {shown}")
+        notes.append(f"given depth: {len(refused)} maps are not used: {listed(refused, SHOWN)}")
     return notes
 
 
@@ -220,8 +213,7 @@ def pinhole_view(view: View) -> View:
     if camera.model == "pinhole":
         return view
     if camera.model not in geometry.CENTRAL:
-        fix = "start from points (--init.source points), with --strategy clone_split or mcmc"
-        raise UsageError(f"depth estimation and coverage do not support the camera model {camera.model!r}: {fix}")
+        raise UsageError(f"no depth for {camera.model!r} cameras: give --init.source points, --strategy mcmc or clone_split")
     shape = (camera.height, camera.width)
     x, y = (_lens_pixels(camera) - 0.5).reshape(*shape, 2).astype(np.float32).transpose(2, 0, 1)  # OpenCV's centres are whole
     inside = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError
-from warpgs.files import read_input, unread_reason, write_bytes
+from warpgs.errors import DataError, ResourceError, explained
+from warpgs.files import read_input, write_bytes
 from warpgs.folders import cache_home, private_folder
 from warpgs.onnx import Model, fixed_size
 from warpgs.process import say
@@ -82,8 +82,7 @@ class Network(Model):
             raise DataError(f"{path}: its input is a {kind}; float or float16 is needed")
         dims, text = [d if isinstance(d, int) and d > 0 else None for d in shape], " x ".join(map(str, shape))
         if len(dims) != 4 or dims[0] not in (1, None):
-            needed = "one image, 1 x 3 x height x width or 1 x height x width x 3, is needed"
-            raise DataError(f"{path}: its input is {text}; {needed}")
+            raise DataError(f"{path}: its input is {text}, not one image, 1 x 3 x height x width or 1 x height x width x 3")
         self.layout = "nchw" if dims[1] == 3 or (dims[1] is None and dims[3] != 3) else "nhwc"
         if self.layout == "nhwc" and dims[3] != 3:
             raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of images")
@@ -162,14 +161,11 @@ def side_file(model: Path) -> Path:
 
 def read_side_file(model: Path) -> dict:
     """Return the entries of the JSON file beside a model; none without such a file."""
-    path = side_file(model)
+    path, fix = side_file(model), f"fix it, with keys out of {', '.join(KEYS)}, or remove it"
     if not os.path.lexists(path):
         return {}
-    try:
+    with explained(f"{path}: cannot be read", fix, (OSError, schema.SchemaError)):
         return schema.read(path, rule=_DESCRIPTION)
-    except (OSError, schema.SchemaError) as e:
-        why = unread_reason(e) if isinstance(e, OSError) else e
-        raise DataError(f"{path}: cannot be read ({why}); fix it, with keys out of {', '.join(KEYS)}, or remove it") from e
 
 
 def describe(network: Network, defaults: Preprocessing, kind: str) -> tuple[Preprocessing, list[str]]:
@@ -291,10 +287,7 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
         raise DataError(f"{network.path}: its output has the shape {shape}, not that of one depth map; is it a depth network?")
     if preprocessing.output == "depth":
         if not output.min() > 0:
-            raise DataError(
-                f"{network.path}: its smallest depth is {output.min():.3g}, but depths must be above 0; "
-                'if the network gives inverse depth, write {"output": "disparity"} into the JSON file beside it'
-            )
+            raise DataError(f'{network.path}: has depths of 0; for disparity, write {{"output": "disparity"}} into its JSON')
         output = 1 / output
     return unit_range(resize(output, *image.shape[:2]))
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgs.errors import listed
 from warpgs.priors.flow import Features, agreeing_matches, nearest_views, sift_features
 from warpgs.priors.networks import single_threaded_opencv, without_ipp
 from warpgs.process import Task
@@ -158,11 +159,6 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
         ("white balance differs from neighbouring photographs", REMEDY,
          [f"{name} (red {red:.2f}, green {green:.2f}, blue {blue:.2f} x)" for name, red, green, blue in tints]),
     )  # fmt: skip
-    notes: list[str] = [Task(f"{what}: {_listed(named)}; {remedy}") for what, remedy, named in faults if named]
+    notes: list[str] = [Task(f"{what}: {listed(named, MAX_NAMED)}; {remedy}") for what, remedy, named in faults if named]
     alone = [c.name for c in checks if not c.compared_with]
-    return [*notes, *([f"blur and exposure not checked, too few matches: {_listed(alone)}"] if alone else [])]
-
-
-def _listed(words: list[str]) -> str:
-    """Return words as a list: all if there are at most `MAX_NAMED`, otherwise the first ones and the number of the others."""
-    return ", ".join(words[:MAX_NAMED]) + (f" and {len(words) - MAX_NAMED} more" if len(words) > MAX_NAMED else "")
+    return [*notes, *([f"blur and exposure not checked, too few matches: {listed(alone, MAX_NAMED)}"] if alone else [])]

@@ -328,11 +328,9 @@ def _reduced(view: View) -> View:
     width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
     K = np.diag([width / c.width, height / c.height, 1]) @ c.K
     image = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
-    mask = (
-        None
-        if view.mask is None
-        else cv2.resize(view.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    )
+    mask = view.mask
+    if mask is not None:
+        mask = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return View(view.name, replace(c, K=K, width=width, height=height), image, mask)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, listed
 from warpgs.onnx import PROVIDERS
 from warpgs.priors import networks
 from warpgs.process import Detail, Say, counted, silent
@@ -185,8 +185,7 @@ def _by_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: 
         notes.append("depth: neither a network nor other views gave depth, so the importance has no geometry score")
         return lambda i: ((np.zeros(views[i].image.shape[:2], np.float32),), "none")
     fractions = [float(d.valid.mean()) for d in depths]
-    span = f"{min(fractions):.1%} to {max(fractions):.1%}"
-    notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
+    notes.append(Detail(f"depth: from the other views, at {min(fractions):.1%} to {max(fractions):.1%} of the pixels"))
     if poor := [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]:
         notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
 
@@ -220,15 +219,11 @@ def _fall_back(found: list, views: Sequence[View], regions: Sequence[np.ndarray 
         result.append((confidence, boundary, foreground, source))
     reason = "a mask is more reliable than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
-        words = f"semantics: {reason}, so the object's mask or its black background gave the foreground of {_names(replaced)}"
+        words = f"semantics: {reason}, so the object's mask or black background gave the foreground of {listed(replaced, 5)}"
         notes.append(Detail(words) if classical else words)
     if empty:
-        notes.append(f"semantics: no score for {_names(empty)}, which have hardly any foreground and no object mask")
+        notes.append(f"semantics: no score for {listed(empty, 5)}, which have hardly any foreground and no object mask")
     return result
-
-
-def _names(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more views" if len(names) > 5 else "")
 
 
 def view_priors(
@@ -242,8 +237,7 @@ def view_priors(
     # both are opened before either runs: a wrong file is found at once
     opened = None if config.depth_model is None else _by_network("depth", views, config, threads, cache, notes)
     if classical:
-        words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
-        notes.append(Detail(f"{words}; --segmentation-model adds a network"))
+        notes.append(Detail("semantics: saliency as foreground, edges as boundaries; --segmentation-model adds a network"))
         found = [(maps, "saliency and edges") for maps in classical_maps([v.image for v in views], tell)]
     else:
         semantics = _by_network("segmentation", views, config, threads, cache, notes)
@@ -256,6 +250,5 @@ def view_priors(
         priors.append(Prior(d, confidence, boundary, foreground, where, source))
     notes += cache.notes
     if cache.found:
-        words = f"priors: {cache.found} of {cache.found + cache.made} maps were read from the cache {cache.folder}"
-        notes.append(Detail(words))
+        notes.append(Detail(f"priors: {cache.found} of {cache.found + cache.made} maps read from the cache {cache.folder}"))
     return priors, notes

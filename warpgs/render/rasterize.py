@@ -69,12 +69,8 @@ def _check_type(name: str, array: Any) -> None:
     kind = str(array.dtype).removeprefix("torch.")
     if isinstance(array, Tensor):
         launch.check_device(f"camera.{name}", array)
-        if array.layout != torch.strided:
-            raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
-    if kind in ("float16", "bfloat16"):
-        raise TypeError(f"camera.{name} must be float32 or float64, not {array.dtype}: its rounding would shift the image")
-    if not kind.startswith(("float", "int", "uint", "bool")):
-        raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")
+    if kind in ("float16", "bfloat16") or not kind.startswith(("float", "int", "uint", "bool")):
+        raise TypeError(f"camera.{name} must be float32 or float64, not {array.dtype}, which would shift the image")
 
 
 def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
@@ -99,10 +95,7 @@ def _check_pose(matrix: list[list[float]], where: str) -> None:
     )  # fmt: skip
     off = max(map(abs, products))
     if not off <= POSE_TOLERANCE:  # products of huge numbers overflow
-        raise ValueError(
-            f"{where} scales or shears: R R^T is off by {off:.2g} from the identity, where R is the upper left 3 x 3 block. "
-            "Give a rotation. If the pose is scaled, divide its first three rows by the scale; this also divides depths"
-        )
+        raise ValueError(f"{where} scales or shears: R R^T is off by {off:.2g} from the identity; divide its rows by the scale")
 
 
 INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
@@ -112,10 +105,8 @@ INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 def checked_pixels(pixels: Tensor, cameras: int, device: torch.device) -> Tensor:
     """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2]."""
     if not isinstance(pixels, Tensor) or pixels.dtype not in INTEGERS:
-        found = pixels.dtype if isinstance(pixels, Tensor) else type(pixels).__name__
-        raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
-    if pixels.layout != torch.strided:
-        raise TypeError(f"pixels must be dense, not {pixels.layout}; pixels.to_dense() converts them")
+        raise TypeError(f"pixels must be a tensor of integers, columns and rows, not {getattr(pixels, 'dtype', type(pixels))}")
+    launch.check_device("pixels", pixels)
     if pixels.ndim not in (2, 3) or pixels.shape[-1] != 2 or (pixels.ndim == 3 and len(pixels) != cameras):
         raise ValueError(f"pixels must have shape [P, 2] or [{cameras}, P, 2], not {list(pixels.shape)}")
     found = pixels.to(device, torch.int64)
@@ -201,7 +192,7 @@ def _check_activated(gaussians: RasterizedGaussians) -> None:
     logits, logs = "in [0, 1]; torch.sigmoid makes them from logits", "at least 0; torch.exp makes them from log scales"
     for name, most, fix in (("opacities", 2.0, logits), ("scales", math.inf, logs)):
         values = getattr(gaussians, name, gaussians.means[:0])
-        if values.numel() and values.layout == torch.strided and values.is_floating_point():
+        if values.numel() and values.is_floating_point():
             low, high = map(float, values.detach().aminmax())
             if -math.inf < low < -1 or most < high < math.inf:
                 raise ValueError(f"{name} are from {low:.3g} to {high:.3g}, but must be {fix}")
@@ -224,8 +215,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     x, y, w, h = options.window
     inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
     if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
-        fix = f"its edges must be multiples of {side} px, or edges of the {width} x {height} px image"
-        raise UsageError(f"window {options.window}: {fix}")
+        raise UsageError(f"window {options.window}: edges must be multiples of {side} px, or edges of the image")
     return x, y, w, h
 
 
@@ -250,10 +240,8 @@ def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: Tens
     needed = len(layers[0][1]) * window[2] * window[3] * channels * like.element_size()
     free = free_for(needed, like.device)
     if needed > free:
-        raise ResourceError(
-            f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
-            "smaller images, fewer cameras at once, or parts of an image with RasterizeOptions(window=...)"
-        )
+        size = f"{window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}"
+        raise ResourceError(f"images of {size}: render smaller images, fewer cameras at once, or a window of an image")
 
 
 Layer = tuple[Tensor | None, Tensor]
@@ -278,8 +266,7 @@ def _layer(name: str, background: Any, colors: Tensor | None, inputs: ProjectInp
             raise TypeError(values.dtype)
     except (RuntimeError, TypeError, ValueError) as e:
         raise TypeError(f"{name} must be numbers, 1.0 for white: [{channels}] or [C, {channels}], not {background!r}") from e
-    if values.layout != torch.strided:
-        raise TypeError(f"{name} must be dense, not {values.layout}; {name}.to_dense() converts it")
+    launch.check_device(name, values)
     values = values.to(like)
     if values.ndim not in (1, 2) or values.shape[-1] != channels or (values.ndim == 2 and len(values) != len(like)):
         raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], C={len(like)}, not {list(values.shape)}")
@@ -383,13 +370,11 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     render = _as_render(camera, images, projected, tile_counts, **maps)
     if options.error_bound:
         render = replace(render, error_bound=_error_bound(render.rgb.detach(), gaussians, camera, options))
-    if options.absgrad:
-        render = replace(render, absgrad=True)
     refusing: dict[str, Any] = {}
     for name in WITHOUT_GRADIENT:  # a gradient through an output that has none becomes an error
         if (values := getattr(render, name)) is not None:
             refusing[name] = launch.without_gradient(name, values, render.rgb if name == "error_bound" else render.projected)
-    return replace(render, **refusing)
+    return replace(render, absgrad=bool(options.absgrad), **refusing)
 
 
 @torch.no_grad()
@@ -501,5 +486,4 @@ def select_rule(
                 break
         else:
             return rule, error
-    why = f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}"
-    raise UsageError(f"{why}; raise max_error, or give the Gaussians as float64")
+    raise UsageError(f"rounding alone gives a {measure} error of {error:.1e}; raise max_error, or give Gaussians as float64")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, explained
 from warpgs.files import filling, is_empty, make_folder, write_bytes
 from warpgs.geometry import look_at, matmul, pose_of
 from warpgs.process import Say, counted, silent
@@ -169,11 +169,8 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
     K, first = cameras[0].K, cameras[0]
     camera_lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     camera_lines.append(f"1 PINHOLE {first.width} {first.height} {join((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), 6)}")
-    image_lines = [
-        "# Image list with two lines of data per image:",
-        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
-    ]
+    image_lines = ["# Image list with two lines of data per image:"]
+    image_lines += ["#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "#   POINTS2D[] as (X, Y, POINT3D_ID)"]
     tracks: list[list[str]] = [[] for _ in x]
     for c, camera in enumerate(cameras):
         V = camera.viewmat
@@ -183,10 +180,8 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
         image_lines.append(" ".join(f"{join(p, 4)} {row + 1}" for p, row in zip(xy, rows)))
         for k, row in enumerate(rows):
             tracks[row].append(f"{c + 1} {k}")
-    point_lines = [
-        "# 3D point list with one line of data per point:",
-        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    ]
+    point_lines = ["# 3D point list with one line of data per point:"]
+    point_lines.append("#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)")
     for i, (p, rgb) in enumerate(zip(x, np.round(255 * colors).astype(int))):
         point_lines.append(f"{i + 1} {join(p, 8)} {rgb[0]} {rgb[1]} {rgb[2]} 0.0 {' '.join(tracks[i])}")
     named = {"cameras.txt": camera_lines, "images.txt": image_lines, "points3D.txt": point_lines}
@@ -206,12 +201,9 @@ def _write(folder: Path, views: int, least: int, train: int, size: tuple[int, in
         raise UsageError(f"a demo of this kind needs at least {least} views ({train} to fit, the rest held out), not {views}")
     if min(size) < MIN_SIDE:
         raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {size[0]} x {size[1]}")
-    try:
+    with explained(f"{folder} cannot be read", "name a folder that you may write to", kind=ResourceError):
         if folder.exists() and not (folder.is_dir() and is_empty(folder)):
-            what = "is not empty, and the demo overwrites nothing" if folder.is_dir() else "is a file"
-            raise UsageError(f"{folder} {what}; name a new or an empty folder")
-    except OSError as e:
-        raise ResourceError(f"{folder} cannot be read ({e.strerror or e}); name a folder that you may write to") from e
+            raise UsageError(f"{folder} {'is not empty' if folder.is_dir() else 'is a file'}; name a new or an empty folder")
     with filling(folder) as temporary:  # before the work: a folder that cannot be made is reported at once
         for path, content in contents().items():
             make_folder((temporary / path).parent)

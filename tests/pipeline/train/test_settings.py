@@ -115,7 +115,7 @@ def test_a_file_starts_from_another(tmp_path):
         ("init = 3", "init is a group of settings"),
         ("depth-mean = [0.1, 0.2, 0.3]", "the setting depth-mean was removed: give it in FILE.onnx.json"),
         ('strategy = "best"', "my.toml: unknown strategy 'best'"),
-        ('strategy = "json:JSONDecoder"', "in a preset that is a .py file"),
+        ('strategy = "json:JSONDecoder"', "name it by flag, .py preset"),
         ('loss-terms = "json:JSONDecoder"', "does not load your code"),
         ('base = "json:dumps"', "is code; a preset file never loads code"),
         ('base = "../a.toml"', "is outside the folder of the file"),
