@@ -10,6 +10,7 @@ import io
 import json
 import math
 import os
+import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -21,7 +22,6 @@ import numpy as np
 from warpgs.errors import expect
 from warpgs.export import base
 from warpgs.files import is_within, make_folder, read_file, remove_file, replacing
-from warpgs.io.image_files import header_size, webp_chunks
 from warpgs.scene import ORIGIN
 
 META = "meta.json"
@@ -301,10 +301,8 @@ def _pixels(name: str, content: bytes, n: int) -> np.ndarray:
     """Return the RGBA pixels [P, 4] of an image of at least ``n``; its size is checked before it is decoded."""
     import cv2
 
-    kinds = {kind for kind, _ in webp_chunks(content)}
-    still = b"VP8L" in kinds and not kinds & {b"VP8 ", b"ANIM", b"ANMF"}
-    expect(still, f"{name[:40]!r} is not a lossless WebP image")
-    width, height = header_size("WEBP", content)
+    width, height = _webp_size(content)
+    expect(width * height, f"{name[:40]!r} is not a lossless WebP image")
     expect(n <= width * height <= MAX_PIXELS * n + SMALL, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
     image = None
     with contextlib.suppress(cv2.error):
@@ -314,6 +312,20 @@ def _pixels(name: str, content: bytes, n: int) -> np.ndarray:
     if image.shape[2] == 4:
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA, image).reshape(-1, 4)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA).reshape(-1, 4)
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """Return width and height [px] of a lossless, still WebP image; zeros for any other file."""
+    at = 12 if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else len(data)
+    while at + 13 <= len(data):
+        kind, length = struct.unpack_from("<4sI", data, at)
+        if kind == b"VP8L":
+            bits = int.from_bytes(data[at + 9 : at + 13], "little")
+            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        if kind in (b"VP8 ", b"ANIM", b"ANMF") or (kind == b"VP8X" and data[at + 8] & 2):
+            break
+        at += 8 + length + length % 2
+    return 0, 0
 
 
 def _book(part: dict[str, Any]) -> np.ndarray:

@@ -175,7 +175,7 @@ def _decoded(name: str, data: bytes) -> np.ndarray | None:
             pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
         return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
     if name == "WEBP":
-        expect(any(kind in WEBP_PIXELS for kind, _ in webp_chunks(data)), "it holds no pixels")
+        expect(any(kind in WEBP_PIXELS for kind, _ in _webp_chunks(data)), "it holds no pixels")
     elif name in ("PNG", "BMP"):
         with _opened(name, data) as image:
             plain = name != "BMP" or image.info.get("compression") not in BMP_RLE
@@ -263,7 +263,7 @@ WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
 """Chunks of a WebP that hold pixels: lossy, lossless, a frame of an animation."""
 
 
-def webp_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Yield kind and contents of each chunk of a WebP; they must fill the length that the file announces."""
     expect(len(data) >= 20 and data[8:12] == b"WEBP", "it is not a WebP file")
     view = memoryview(data)
@@ -278,7 +278,7 @@ def webp_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 def _webp_size(data: bytes) -> tuple[int, int]:
     """Return width and height [px] of a WebP; Pillow would allot its canvas first, up to a gigabyte."""
-    kind, body = next(webp_chunks(data), (b"", memoryview(b"")))
+    kind, body = next(_webp_chunks(data), (b"", memoryview(b"")))
     if len(body) >= 10 and kind == b"VP8X":
         return int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
     if len(body) >= 10 and kind == b"VP8 " and body[3:6] == b"\x9d\x01\x2a":
@@ -542,7 +542,7 @@ def _block(data: bytes) -> bytes:
         head = itertools.takewhile(lambda segment: segment[0] != SOS, jpeg_segments(data))
         return next((body for marker, body, _ in head if marker == APP1 and body.startswith(PREFIX)), b"")
     if name == "WEBP":
-        return bytes(next((body for kind, body in webp_chunks(data) if kind == b"EXIF"), b""))
+        return bytes(next((body for kind, body in _webp_chunks(data) if kind == b"EXIF"), b""))
     if name in ("PNG", "AVIF"):
         with _opened(name, data) as image:
             return bytes(image.info.get("exif", b""))
