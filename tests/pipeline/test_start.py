@@ -294,7 +294,7 @@ def test_extrapolated_points_come_last_or_a_start_says_why_there_are_none():
         start = initial_points(chosen, None, settings, np.random.default_rng(0))
         assert reason in start.how and start.extrapolated == 0
         plain = dataclasses.replace(settings, extrapolate=False)
-        assert "extrapolated" not in initial_points(given, None, plain, np.random.default_rng(0)).how
+        assert "extrapolated" not in initial_points(chosen, None, plain, np.random.default_rng(0)).how
 
 
 @pytest.mark.parametrize("extrapolated", [1, 0])

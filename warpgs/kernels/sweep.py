@@ -21,6 +21,8 @@ Shorts, ShortRows = wp.array(dtype=wp.int16), wp.array2d(dtype=wp.int16)
 FloatRows, DoubleRows, Points = wp.array2d(dtype=float), wp.array2d(dtype=wp.float64), wp.array(dtype=wp.vec3d)
 LongRows, longs = wp.array2d(dtype=wp.int64), wp.types.vector(4, wp.int64)
 
+HOST, ALONE = torch.device("cpu"), 0
+"""Device of these kernels; and cost of an item where the calling thread works alone: each view has a thread of its own."""
 BEHIND = 1e-9
 """Ratio of a point's depth to its depth in the first view, up to which the point counts as behind a camera."""
 ROOT, FARTHEST = math.sqrt(2.0), 2**62
@@ -238,10 +240,9 @@ def _array(values: np.ndarray, dtype: type, axes: int) -> wp.array:
     return launch.as_array(torch.from_numpy(np.ascontiguousarray(values)), dtype, axes)
 
 
-def _launched(kernel: wp.Kernel, count: int, *inputs: Any, cost: int = 0) -> None:
-    """Launch a kernel on numpy arrays, by this thread alone unless a cost is given: callers have threads of their own."""
-    tensors = [torch.from_numpy(np.ascontiguousarray(a)) if isinstance(a, np.ndarray) else a for a in inputs]
-    launch.launch(kernel, count, tensors, torch.device("cpu"), cost=cost)
+def _tensors(*inputs: Any) -> list[Any]:
+    """Return the inputs of a kernel, numpy arrays as tensors of the same memory."""
+    return [torch.from_numpy(np.ascontiguousarray(a)) if isinstance(a, np.ndarray) else a for a in inputs]
 
 
 def focal_length(camera: Camera) -> float:
@@ -277,7 +278,7 @@ def occluding(cameras: Sequence[Camera], depths: Sequence[np.ndarray], pixels: P
     depths = [np.ascontiguousarray(d, np.float32) for d in depths]
     maps = np.array([(d.ctypes.data, *d.shape) for d in depths], np.int64).reshape(-1, 3)
     if cameras:
-        _launched(occlude, len(hides), pixels, rows, maps, fraction, hides)
+        launch.launch(occlude, len(hides), _tensors(pixels, rows, maps, fraction, hides), HOST, cost=ALONE)
     return hides.astype(bool)
 
 
@@ -290,7 +291,8 @@ def cell_runs(
     """
     runs, rows = np.empty((rows[:, 0].sum() + 1, 3), np.int64), rows.copy()  # one more, since kernels take no empty array
     rows[:, 0] = np.cumsum(rows[:, 0]) - rows[:, 0]
-    _launched(find_runs, len(rows), pixels, factor, longs(*low), longs(*weights), rows, runs)
+    inputs = _tensors(pixels, factor, longs(*low), longs(*weights), rows, runs)
+    launch.launch(find_runs, len(rows), inputs, HOST, cost=ALONE)
     return rows, runs[:-1]
 
 
@@ -302,17 +304,18 @@ def cell_means(count: int, parts: Iterable[tuple[Any, ...]]) -> tuple[np.ndarray
     places, shades, counts = *np.zeros((2, count + 1, 3)), np.zeros(count + 1)
     tasks = 4 * torch.get_num_threads()
     for part in (p for p in parts if len(p[2])):
-        _launched(add_runs, tasks, -(-count // tasks), *part, places, shades, counts, cost=launch.SERIAL_WORK)
+        inputs = _tensors(-(-count // tasks), *part, places, shades, counts)
+        launch.launch(add_runs, tasks, inputs, HOST, cost=launch.SERIAL_WORK)
     return tuple(sums[:count] / counts[:count, None] for sums in (places, shades))
 
 
 def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
     """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola, float64 [H, W], from costs [H, W, P]."""
     height, width, _ = costs.shape
-    found = torch.empty(height, width, dtype=torch.float64, device="cpu")
+    found = np.empty((height, width))
     inputs = [costs.contiguous(), len(inverses), float(inverses[0]), float(inverses[1] - inverses[0]), found]
-    launch.launch(best, height * width, inputs, costs.device, cost=max(1, len(inverses) // 10))
-    return found.numpy()
+    launch.launch(best, found.size, _tensors(*inputs), costs.device, cost=max(1, len(inverses) // 10))
+    return found
 
 
 def _between(first: Camera, second: Camera) -> tuple[wp.mat33d, wp.vec3d]:
@@ -329,16 +332,14 @@ def check_round_trip(
     """Return a mask [H, W] of the pixels whose round trip through another view's inverse depth ends within ``most`` px."""
     # ``sensitivity`` [H, W], the change of depth per pixel [u/px], is lowered in place where this pair of views has a smaller
     # value.
-    agrees = torch.empty(own.shape, dtype=torch.uint8, device="cpu")
+    agrees = np.empty(own.shape, np.uint8)
     rotation, translation = geometry.relative_pose(first, second)
-    center = -geometry.matmul(rotation.T, translation[:, None])[:, 0]
-    maps = [torch.from_numpy(np.ascontiguousarray(a)) for a in (own, found, sensitivity)]
-    inputs = [
-        *maps[:2], *_between(first, second), *_between(second, first), wp.mat33d(*geometry.inverse(first.K).ravel()),
-        wp.vec3d(*center), most, math.cos(math.radians(min_parallax)), maps[2], agrees,
-    ]  # fmt: skip
-    launch.launch(check, own.size, inputs, agrees.device, cost=5)
-    return agrees.numpy().astype(bool)
+    center = wp.vec3d(*-geometry.matmul(rotation.T, translation[:, None])[:, 0])
+    ways = *_between(first, second), *_between(second, first), wp.mat33d(*geometry.inverse(first.K).ravel()), center
+    limits = most, math.cos(math.radians(min_parallax))
+    inputs = _tensors(own, found, *ways, *limits, sensitivity, agrees)
+    launch.launch(check, own.size, inputs, HOST, cost=5)
+    return agrees.astype(bool)
 
 
 # Matching costs of a plane sweep on a CPU: other images are warped by a plane's homography and correlated in windows.
