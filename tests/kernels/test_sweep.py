@@ -10,7 +10,17 @@ from tests.priors.rigs import rig, still_life
 from tests.reference import sweep as plane_costs
 from tests.reference.sweep import best_inverse, scanline_costs as defined
 from warpgs.geometry import back_project, seen_pixels
-from warpgs.kernels.sweep import LARGEST, best_inverses, lifted_pixels, occluding, scanline_costs
+from warpgs.kernels.sweep import (
+    LARGEST,
+    best_inverses,
+    cell_means,
+    cell_runs,
+    focal_length,
+    given,
+    lifted,
+    occluding,
+    scanline_costs,
+)
 from warpgs.priors.sweep import UNIT, matching_costs_cpu
 from warpgs.scene import Camera, View
 
@@ -77,16 +87,42 @@ def test_lifted_and_occluding_points_are_those_of_geometry():
     first, second, third = rig()
     second.K[0, 1] = 3.0
     generator = np.random.default_rng(5)
-    pixels = generator.permutation(64 * 48)[:500]
-    depths = generator.uniform(2, 6, 500).astype(np.float32)
-    points = lifted_pixels(second, pixels, depths)
-    at = np.stack([pixels % 64, pixels // 64], 1) + 0.5
-    assert np.allclose(points, back_project(second, at, depths.astype(float)), rtol=1e-14, atol=1e-14)
-    points = np.concatenate([points, generator.uniform(-9, 9, (500, 3))])
+    depths = np.where(generator.uniform(size=(48, 64)) < 0.2, generator.uniform(2, 6, (48, 64)), 0).astype(np.float32)
+    pixels, at = lifted(second, depths), np.flatnonzero(depths)
+    runs, colors = np.stack([at, at + 1], 1), generator.uniform(size=(64 * 48, 3)).astype(np.float32)
+    lone, own = cell_means(len(at), [(pixels, colors, runs, np.arange(len(at)))])
+    wanted = back_project(second, np.stack([at % 64, at // 64], 1) + 0.5, depths.ravel()[at].astype(float))
+    assert np.allclose(lone, wanted, rtol=1e-14, atol=1e-14) and np.array_equal(own, colors[at].astype(float))
+    points = np.concatenate([lone, generator.uniform(-9, 9, (500, 3))])
     maps = [generator.uniform(0, 8, (48, 64)).astype(np.float32) for _ in range(2)]
-    wanted = np.zeros(1000, bool)
+    wanted = np.zeros(len(points), bool)
     for camera, depth in zip((second, third), maps):
         seen, rows, columns, z = seen_pixels(camera, points)
         wanted[seen] |= z < 0.9 * depth[rows, columns]
-    assert np.array_equal(occluding((second, third), maps, points, 0.9), wanted) and 0.1 < wanted.mean() < 0.9
-    assert not occluding((), (), points, 0.9).any() and len(occluding((first,), maps[:1], points[:0], 0.9)) == 0
+    row, none = (given(p, np.ones(len(p))) for p in (points, points[:0]))
+    (hides,), inside = occluding((second, third), maps, row, 0.9), occluding((second, third), maps, pixels, 0.9)
+    assert np.array_equal(hides, wanted) and 0.1 < wanted.mean() < 0.9
+    assert np.array_equal(inside.ravel()[at], wanted[: len(at)]) and inside[depths == 0].all()
+    assert not occluding((), (), row, 0.9).any() and occluding((first,), maps[:1], none, 0.9).shape == (1, 0)
+    assert np.array_equal(occluding((), (), pixels, 0.9), depths == 0)
+
+
+def test_runs_of_points_in_a_cell_are_those_of_a_dense_grid():
+    """At all levels, across gaps and borders of rows; the second call fills in what the first one counts."""
+    camera, generator = rig()[1], np.random.default_rng(6)
+    depths = (np.exp2(generator.uniform(-2, 4, (48, 8))).repeat(8, 1) * (generator.uniform(size=(48, 64)) < 0.9)).astype(
+        np.float32
+    )
+    pixels, at = lifted(camera, depths), np.flatnonzero(depths)
+    rows, _ = cell_runs(pixels, 3.0, np.zeros((48, 9), np.int64), (0,) * 4, (0,) * 4)
+    found = [cell_runs(pixels, 3.0, rows, (-5,) * 4, weights)[1] for weights in np.eye(4, dtype=int)]
+    begins, ends = found[0][:, :2].T
+    points = back_project(camera, np.stack([at % 64, at // 64], 1) + 0.5, depths.ravel()[at].astype(float))
+    level = np.round(np.log2(3.0 * depths.ravel()[at].astype(float) / focal_length(camera)))
+    cells = np.column_stack([level, np.floor(points / np.exp2(level)[:, None])])
+    changes = (np.diff(cells, axis=0) != 0).any(1) | (np.diff(at) > 1) | (np.diff(at // 64) > 0)
+    first = np.concatenate([[0], 1 + np.flatnonzero(changes)])
+    assert np.array_equal(begins, at[first]) and np.array_equal(ends, at[np.append(first[1:], len(at)) - 1] + 1)
+    assert np.array_equal(np.stack([own[:, 2] for own in found], 1) - 5, cells[first]) and len(set(level)) > 5
+    assert rows[:, 0].sum() == len(first) and np.array_equal(rows[:, 1:5].min(0), cells.min(0))
+    assert np.array_equal(rows[:, 5:].max(0), cells.max(0)) and 1.05 < len(at) / len(first) < 4

@@ -14,11 +14,11 @@ from warpgs.app.cli import main
 from warpgs.compat import gsplat, inria
 from warpgs.geometry import back_project, in_image, project_points
 from warpgs.kernels import launch as interop
+from warpgs.kernels.sweep import given
 from warpgs.pipeline.metrics.scores import render_view, score
 from warpgs.pipeline.model.depth_points import (
     BEYOND,
     BEYOND_PX,
-    CHUNK,
     EXTRAPOLATED_OPACITY,
     REACH,
     STEP,
@@ -100,20 +100,28 @@ def test_points_of_the_reconstruction_fill_what_no_depth_confirms():
 
 
 def test_merging_takes_the_mean_of_a_cell():
-    """Points of a cell are added up in their order, whatever the parts and chunks; cells come in the order of their place."""
+    """Points of a cell are added up in their order, whatever the parts; cells come in the order of their place."""
+
+    def cells(*parts):
+        """Return the number of each point's cell."""
+        return np.concatenate(
+            [np.repeat(own[:, 2], own[:, 1] - own[:, 0]) for own in merge_cells([given(*p) for p in parts], 1)]
+        )
+
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.3, 0.3], [1.2, 0.1, 0.1], [0.2, 0.2, 0.2]])
-    (cells,) = merge_cells([points], [np.array([1.0, 1.1, 0.9, 4.0])])
-    assert cells[0] == cells[1] and len(set(cells.tolist())) == 3
-    cloud = merge([points], [points.astype(np.float32)], [cells])
+    widths = np.array([1.0, 1.1, 0.9, 4.0])
+    numbers = cells((points, widths))
+    assert numbers[0] == numbers[1] and len(set(numbers.tolist())) == 3
+    cloud = merge([given(points, widths)], [points.astype(np.float32)], merge_cells([given(points, widths)], 1))
     assert len(cloud) == 3 and np.abs(cloud.points - 0.2).sum(1).min() < 1e-12
     assert np.allclose(cloud.points, cloud.colors)
     # an outlier so far away that cells have no single number each: the others share cells as they did without it
     points = np.random.default_rng(0).uniform(-1, 1, (200, 3))
-    (near,) = merge_cells([points], [np.full(200, 0.25)])
-    far = np.concatenate(merge_cells([points, np.array([[1e14, -1e14, 1e14]])], [np.full(200, 0.25), np.full(1, 0.25)]))
+    near = cells((points, np.full(200, 0.25)))
+    far = cells((points, np.full(200, 0.25)), (np.array([[1e14, -1e14, 1e14]]), np.full(1, 0.25)))
     assert np.array_equal(far[:200][:, None] == far[:200], near[:, None] == near) and (far[200] != far[:200]).all()
     generator = np.random.default_rng(0)
-    points, colors = generator.uniform(-2, 2, (CHUNK + 500, 3)), generator.uniform(size=(CHUNK + 500, 3)).astype(np.float32)
+    points, colors = generator.uniform(-2, 2, (30_000, 3)), generator.uniform(size=(30_000, 3)).astype(np.float32)
     widths = generator.uniform(0.2, 0.5, len(points))
     level = np.round(np.log2(0.5 * widths))
     rows = np.column_stack([level, np.floor(points / np.exp2(level)[:, None])])
@@ -122,9 +130,9 @@ def test_merging_takes_the_mean_of_a_cell():
         np.stack([np.bincount(wanted.ravel(), v) for v in values.T.astype(float)], 1) / counts[:, None]
         for values in (points, colors)
     ]
-    for ends in ([], [0, 7, CHUNK + 500], [300, 301, 20_000]):
-        parts = [np.split(a, ends) for a in (points, colors, widths)]
-        cloud = merge(*parts[:2], merge_cells(parts[0], parts[2], 0.5))
+    for ends in ([], [0, 7, 30_000], [300, 301, 20_000]):
+        parts = [given(*part) for part in zip(np.split(points, ends), np.split(widths, ends))]
+        cloud = merge(parts, np.split(colors, ends), merge_cells(parts, 0.5))
         assert np.array_equal(cloud.points, means[0]) and np.array_equal(cloud.colors, means[1].astype(np.float32))
 
 
@@ -136,6 +144,7 @@ def test_filled_points_come_last_and_hide_nothing():
     assert np.array_equal(cloud.points[: len(bare)], bare.points) and len(cloud) > len(bare)
     assert "75 % of pixels by sweep, " in notes[0] and notes[-1].endswith(f"{len(cloud) - len(bare)} filled in")
     filled = cloud.points[len(bare) :]
+    filled = given(filled, np.ones(len(filled)))
     assert not any(in_free_space(filled, views[j : j + 1], [0.93 * depths[j].depth], -1).any() for j in range(3))
     # a view whose depth was not searched for neither fills nor hides: the work for each of many views is bounded
     unsearched = dataclasses.replace(depth_of(0 * depths[2].depth), searched=False)
@@ -151,8 +160,9 @@ def test_free_space_bounds_and_objects_on_black():
     depth = np.full((10, 10), 4.0)
     depth[:, :5] = 0
     points = np.array([[0.1, 0, 2], [0.1, 0, 3.9], [0.1, 0, 6], [-0.1, 0, 2], [50, 0, 2]])
-    assert in_free_space(points, views, [depth, depth], 0).tolist() == [True, False, False, False, False]
-    assert not in_free_space(points, views[:1], [depth], 0).any()
+    row = given(points, np.ones(5))
+    assert in_free_space(row, views, [depth, depth], 0).tolist() == [[True, False, False, False, False]]
+    assert not in_free_space(row, views[:1], [depth], 0).any()
     points = np.stack([np.zeros(101), np.zeros(101), np.linspace(2, 4, 101)], 1)
     near, far = depth_bounds(views[0], points, (1, 2))
     assert near == pytest.approx(2.04 / 1.3) and far == pytest.approx(3.96 * 3)
@@ -280,11 +290,11 @@ def test_extrapolated_points_come_last_or_a_start_says_why_there_are_none():
     masked = [dataclasses.replace(v, mask=corner) for v in views]
     config = InitConfig(source="sweep", merge_px=4, fill_px=8, extrapolate=True)
     random = dataclasses.replace(config, source="random", random_count=200)
-    for given, settings, reason in ((masked, config, "none extrapolated (masks"), (views, random, "sweep or flow")):
-        start = initial_points(given, None, settings, np.random.default_rng(0))
+    for chosen, settings, reason in ((masked, config, "none extrapolated (masks"), (views, random, "sweep or flow")):
+        start = initial_points(chosen, None, settings, np.random.default_rng(0))
         assert reason in start.how and start.extrapolated == 0
         plain = dataclasses.replace(settings, extrapolate=False)
-        assert "extrapolated" not in initial_points(given, None, plain, np.random.default_rng(0)).how
+        assert "extrapolated" not in initial_points(chosen, None, plain, np.random.default_rng(0)).how
 
 
 @pytest.mark.parametrize("extrapolated", [1, 0])

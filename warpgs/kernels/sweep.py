@@ -1,7 +1,8 @@
 """Plane sweeps: depths of the planes, their costs, and the scanlines that smooth them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +18,15 @@ from warpgs.scene import Camera
 # Kernels use float64 and one task per pixel. No operations are fused, so depths are the same bits on any processor.
 
 Shorts, ShortRows = wp.array(dtype=wp.int16), wp.array2d(dtype=wp.int16)
-FloatRows, DoubleRows = wp.array2d(dtype=float), wp.array2d(dtype=wp.float64)
+FloatRows, DoubleRows, Points = wp.array2d(dtype=float), wp.array2d(dtype=wp.float64), wp.array(dtype=wp.vec3d)
+LongRows, longs = wp.array2d(dtype=wp.int64), wp.types.vector(4, wp.int64)
 
+HOST, ALONE = torch.device("cpu"), 0
+"""Device of these kernels; and cost of an item where the calling thread works alone: each view has a thread of its own."""
 BEHIND = 1e-9
 """Ratio of a point's depth to its depth in the first view, up to which the point counts as behind a camera."""
+ROOT, FARTHEST = math.sqrt(2.0), 2**62
+"""Ratio of a width to the power of two from which on the next one is nearer; and more than any coordinate of a cell."""
 STEP = 1e-3
 """Step of the central difference that gives the change of depth per pixel, as a fraction of the inverse depth."""
 
@@ -94,77 +100,222 @@ def check(
     agrees[row, column] = wp.uint8(good)
 
 
-@wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
-def lift(
-    begin: int, pixels: Longs, width: wp.int64, depths: Floats, to_ray: wp.mat33d, turn: wp.mat33d, shift: wp.vec3d,
-    # outputs
-    points: DoubleRows,
-):  # fmt: skip
-    """Find the world point at the centre of a pixel and at its z-depth."""
-    i = begin + wp.tid()
-    row = pixels[i] // width
-    x = wp.float64(pixels[i] - row * width) + wp.float64(0.5)
+@wp.struct
+class Pixels:
+    """Pixels that become points at their z-depths [u] above 0; or a row of given points, and widths of pixels there [u]."""
+
+    depths: FloatRows
+    points: Points
+    widths: wp.array(dtype=wp.float64)
+    to_ray: wp.mat33d
+    turn: wp.mat33d
+    shift: wp.vec3d
+    focal: wp.float64
+
+
+@wp.func
+def lift(pixels: Pixels, row: wp.int32, column: wp.int32) -> wp.vec3d:
+    """Return the world point at the centre of a pixel and at its z-depth."""
+    if pixels.points.shape[0] > 0:
+        return pixels.points[column]
+    x = wp.float64(column) + wp.float64(0.5)
     y = wp.float64(row) + wp.float64(0.5)
-    z = wp.float64(depths[i])
+    z = wp.float64(pixels.depths[row, column])
+    ray = pixels.to_ray
     p = wp.vec3d()
     for k in range(3):
-        p[k] = z * (x * to_ray[k, 0] + y * to_ray[k, 1] + to_ray[k, 2]) - shift[k]
+        p[k] = z * (x * ray[k, 0] + y * ray[k, 1] + ray[k, 2]) - pixels.shift[k]
+    turn = pixels.turn
+    point = wp.vec3d()
     for k in range(3):  # sums in the order of `geometry.back_project`
-        points[i, k] = p[0] * turn[0, k] + p[1] * turn[1, k] + p[2] * turn[2, k]
+        point[k] = p[0] * turn[0, k] + p[1] * turn[1, k] + p[2] * turn[2, k]
+    return point
 
 
 @wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
 def occlude(
-    begin: int, points: DoubleRows, cameras: DoubleRows, camera: int, depths: FloatRows, fraction: float,
-    # outputs
-    hides: wp.array(dtype=wp.uint8),
+    begin: int, pixels: Pixels, cameras: DoubleRows, maps: LongRows, fraction: float,
+    # outputs, added to
+    hides: wp.array2d(dtype=wp.uint8),
 ):  # fmt: skip
-    """Set the flag of a point at less than a fraction of the depth of its pixel."""
-    i = begin + wp.tid()
-    if hides[i] == wp.uint8(0):
-        p = wp.vec3d()
-        for k in range(3):  # sums in the order of `geometry.project_points`
-            row = cameras[camera]
-            p[k] = points[i, 0] * row[4 * k] + points[i, 2] * row[4 * k + 2] + points[i, 1] * row[4 * k + 1] + row[4 * k + 3]
-        if p[2] > wp.float64(0.0):
-            x = p[0] / p[2] * cameras[camera, 12] + cameras[camera, 14] + p[1] / p[2] * cameras[camera, 13]
-            y = p[0] / p[2] * cameras[camera, 15] + cameras[camera, 17] + p[1] / p[2] * cameras[camera, 16]
-            inside = x >= wp.float64(0.0) and y >= wp.float64(0.0)
-            if inside and x < wp.float64(depths.shape[1]) and y < wp.float64(depths.shape[0]):
-                if p[2] < wp.float64(fraction * depths[int(y), int(x)]):
-                    hides[i] = wp.uint8(1)
+    """Flag a row's points at less than a fraction of the depth of their pixel in a camera; maps are addresses and sizes."""
+    row = begin + wp.tid()
+    last = int(0)
+    for column in range(hides.shape[1]):
+        hidden = hides[row, column] != wp.uint8(0)
+        point = lift(pixels, row, column)
+        tried = int(0)
+        while tried < cameras.shape[0] and not hidden:
+            i = (last + tried) % cameras.shape[0]
+            tried += 1
+            p = wp.vec3d()
+            for k in range(3):  # sums in the order of `geometry.project_points`
+                p[k] = point[0] * cameras[i, 4 * k] + point[2] * cameras[i, 4 * k + 2] + point[1] * cameras[i, 4 * k + 1]
+                p[k] += cameras[i, 4 * k + 3]
+            if p[2] > wp.float64(0.0):
+                x = p[0] / p[2] * cameras[i, 12] + cameras[i, 14] + p[1] / p[2] * cameras[i, 13]
+                y = p[0] / p[2] * cameras[i, 15] + cameras[i, 17] + p[1] / p[2] * cameras[i, 16]
+                inside = x >= wp.float64(0.0) and y >= wp.float64(0.0)
+                if inside and x < wp.float64(maps[i, 2]) and y < wp.float64(maps[i, 1]):
+                    depths = wp.array(ptr=wp.uint64(maps[i, 0]), shape=(int(maps[i, 1]), int(maps[i, 2])), dtype=float)
+                    hidden = p[2] < wp.float64(fraction * depths[int(y), int(x)])
+                    last = wp.where(hidden, i, last)  # often hides the next point, too
+        hides[row, column] = wp.uint8(wp.where(hidden, 1, 0))
 
 
-def lifted_pixels(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Return the world points [N, 3] [u] of a pinhole's pixels, int64 [N], counted row by row, at z-depths [N] [u], float32."""
+@wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
+def find_runs(
+    begin: int, pixels: Pixels, factor: wp.float64, low: longs, weights: longs,
+    # outputs: of each row the first run, replaced by their number, and the lowest and highest cells; runs, and one more
+    rows: LongRows, runs: LongRows,
+):  # fmt: skip
+    """Find the runs of a row's points in one grid cell: where they begin and end, and the number of the cell."""
+    row = begin + wp.tid()
+    first = int(rows[row, 0])
+    at = first - 1
+    scale = wp.float64(1.0)
+    level = wp.int64(0)
+    corner = wp.vec3d()
+    lowest = longs(wp.int64(FARTHEST))
+    highest = longs(wp.int64(-FARTHEST))
+    goes_on = bool(False)
+    for column in range(pixels.depths.shape[1]):
+        z = pixels.depths[row, column]
+        if z > 0.0:
+            width = factor * (wp.float64(z) / pixels.focal)
+            if pixels.widths.shape[0] > 0:
+                width = factor * pixels.widths[column]
+            while width * scale > wp.float64(ROOT):  # a cell is as wide as the nearest power of two, 1 / scale
+                scale *= wp.float64(0.5)
+                level += wp.int64(1)
+                goes_on = False
+            while width * scale * wp.float64(ROOT) < wp.float64(1.0):
+                scale *= wp.float64(2.0)
+                level -= wp.int64(1)
+                goes_on = False
+            place = lift(pixels, row, column) * scale
+            for k in range(3):
+                goes_on = goes_on and place[k] >= corner[k] and place[k] < corner[k] + wp.float64(1.0)
+            if not goes_on:
+                at += 1
+                corner = wp.vec3d(wp.floor(place[0]), wp.floor(place[1]), wp.floor(place[2]))
+                cell = longs(level, wp.int64(corner[0]), wp.int64(corner[1]), wp.int64(corner[2]))
+                lowest = wp.min(lowest, cell)
+                highest = wp.max(highest, cell)
+                if at + 1 < runs.shape[0]:
+                    runs[at, 0] = wp.int64(row * pixels.depths.shape[1] + column)
+                    runs[at, 2] = wp.dot(cell - low, weights)
+            if at + 1 < runs.shape[0]:
+                runs[at, 1] = wp.int64(row * pixels.depths.shape[1] + column + 1)
+        goes_on = z > 0.0
+    rows[row, 0] = wp.int64(at + 1 - first)
+    for k in range(4):
+        rows[row, k + 1] = lowest[k]
+        rows[row, k + 5] = highest[k]
+
+
+@wp.kernel(enable_backward=False, module="warpgs.kernels.plane_depths")
+def add_runs(
+    begin: int, each: int, pixels: Pixels, colors: wp.array(dtype=wp.vec3), runs: LongRows, ranks: Longs,
+    # outputs, added to
+    places: Points, shades: Points, counts: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    """Add points and colours to the sums of some cells, in the order of the pixels."""
+    low = wp.int64((begin + wp.tid()) * each)
+    for run in range(ranks.shape[0]):
+        rank = ranks[run]
+        if rank >= low and rank < low + wp.int64(each):
+            place = places[rank]
+            shade = shades[rank]
+            row = int(runs[run, 0]) // pixels.depths.shape[1]
+            for i in range(int(runs[run, 0]), int(runs[run, 1])):
+                place += lift(pixels, row, i - row * pixels.depths.shape[1])
+                shade += wp.vec3d(colors[i])
+            places[rank] = place
+            shades[rank] = shade
+            counts[rank] += wp.float64(runs[run, 1] - runs[run, 0])
+
+
+def _array(values: np.ndarray, dtype: type, axes: int) -> wp.array:
+    return launch.as_array(torch.from_numpy(np.ascontiguousarray(values)), dtype, axes)
+
+
+def _tensors(*inputs: Any) -> list[Any]:
+    """Return the inputs of a kernel, numpy arrays as tensors of the same memory."""
+    return [torch.from_numpy(np.ascontiguousarray(a)) if isinstance(a, np.ndarray) else a for a in inputs]
+
+
+def focal_length(camera: Camera) -> float:
+    """Return the geometric mean of both focal lengths [px]."""
+    return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+
+
+def lifted(camera: Camera, depths: np.ndarray) -> Pixels:
+    """Return the pixels of a pinhole that have z-depths [H, W] [u], 0 if unknown, as points."""
     geometry.check_pinhole(camera)
-    points = torch.empty(len(pixels), 3, dtype=torch.float64, device="cpu")
-    pose = wp.mat33d(*camera.viewmat[:3, :3].ravel()), wp.vec3d(*camera.viewmat[:3, 3])
-    numbers, depths = (torch.from_numpy(np.ascontiguousarray(a)) for a in (pixels, depths))
-    inputs = [numbers, camera.width, depths, wp.mat33d(*geometry.inverse(camera.K).ravel()), *pose, points]
-    launch.launch(lift, len(pixels), inputs, points.device)
-    return points.numpy()
+    pixels = Pixels()
+    pixels.depths, pixels.focal = _array(np.asarray(depths, np.float32), wp.float32, 2), focal_length(camera)
+    pixels.to_ray = wp.mat33d(*geometry.inverse(camera.K).ravel())
+    pixels.turn, pixels.shift = wp.mat33d(*camera.viewmat[:3, :3].ravel()), wp.vec3d(*camera.viewmat[:3, 3])
+    return pixels
 
 
-def occluding(cameras: Sequence[Camera], depths: Sequence[np.ndarray], points: np.ndarray, fraction: float) -> np.ndarray:
-    """Return a mask [N], True for points [N, 3] at less than a fraction of a pinhole's z-depths [H, W] [u], 0 if unknown."""
-    hides = torch.zeros(len(points), dtype=torch.uint8, device="cpu")
-    positions = torch.from_numpy(np.ascontiguousarray(points))
-    rows = torch.from_numpy(np.array([(*c.viewmat[:3].ravel(), *c.K[:2].ravel()) for c in cameras], float).reshape(-1, 18))
-    for i, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
+def given(points: np.ndarray, widths: np.ndarray) -> Pixels:
+    """Return points [N, 3] with the widths of a pixel there [N] [u] as one row of pixels."""
+    pixels = Pixels()
+    pixels.depths = _array(np.ones((1, len(points)), np.float32), wp.float32, 2)
+    if len(points):
+        pixels.points, pixels.widths = _array(points, wp.vec3d, 2), _array(widths, wp.float64, 1)
+    return pixels
+
+
+def occluding(cameras: Sequence[Camera], depths: Sequence[np.ndarray], pixels: Pixels, fraction: float) -> np.ndarray:
+    """Return a mask [H, W], True for no point, and points at less than a fraction of z-depths [h, w] [u], 0 if unknown."""
+    hides = (~(pixels.depths.numpy() > 0)).astype(np.uint8)
+    for camera in cameras:
         geometry.check_pinhole(camera)
-        shown = torch.from_numpy(np.ascontiguousarray(depth, np.float32))
-        launch.launch(occlude, len(points), [positions, rows, i, shown, fraction, hides], hides.device)
-    return hides.numpy().astype(bool)
+    rows = np.array([(*c.viewmat[:3].ravel(), *c.K[:2].ravel()) for c in cameras], float).reshape(-1, 18)
+    depths = [np.ascontiguousarray(d, np.float32) for d in depths]
+    maps = np.array([(d.ctypes.data, *d.shape) for d in depths], np.int64).reshape(-1, 3)
+    if cameras:
+        launch.launch(occlude, len(hides), _tensors(pixels, rows, maps, fraction, hides), HOST, cost=ALONE)
+    return hides.astype(bool)
+
+
+def cell_runs(
+    pixels: Pixels, factor: float, rows: np.ndarray, low: Sequence[int], weights: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return of each row of pixels the number of runs, lowest and highest cell, int64 [H, 9]; and the runs, int64 [R, 3].
+
+    A run is points in one grid cell: where it begins and ends, and the number of the cell. There are as many as ``rows`` count.
+    """
+    runs, rows = np.empty((rows[:, 0].sum() + 1, 3), np.int64), rows.copy()  # one more, since kernels take no empty array
+    rows[:, 0] = np.cumsum(rows[:, 0]) - rows[:, 0]
+    inputs = _tensors(pixels, factor, longs(*low), longs(*weights), rows, runs)
+    launch.launch(find_runs, len(rows), inputs, HOST, cost=ALONE)
+    return rows, runs[:-1]
+
+
+def cell_means(count: int, parts: Iterable[tuple[Any, ...]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean points and colours of ``count`` cells, float64 [count, 3] each, added up in the order of the pixels.
+
+    Each part has pixels, colours [H W, 3], runs, and ranks of their cells, int64 [R].
+    """
+    places, shades, counts = *np.zeros((2, count + 1, 3)), np.zeros(count + 1)
+    tasks = 4 * torch.get_num_threads()
+    for part in (p for p in parts if len(p[2])):
+        inputs = _tensors(-(-count // tasks), *part, places, shades, counts)
+        launch.launch(add_runs, tasks, inputs, HOST, cost=launch.SERIAL_WORK)
+    return tuple(sums[:count] / counts[:count, None] for sums in (places, shades))
 
 
 def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
     """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola, float64 [H, W], from costs [H, W, P]."""
     height, width, _ = costs.shape
-    found = torch.empty(height, width, dtype=torch.float64, device="cpu")
+    found = np.empty((height, width))
     inputs = [costs.contiguous(), len(inverses), float(inverses[0]), float(inverses[1] - inverses[0]), found]
-    launch.launch(best, height * width, inputs, costs.device, cost=max(1, len(inverses) // 10))
-    return found.numpy()
+    launch.launch(best, found.size, _tensors(*inputs), costs.device, cost=max(1, len(inverses) // 10))
+    return found
 
 
 def _between(first: Camera, second: Camera) -> tuple[wp.mat33d, wp.vec3d]:
@@ -181,16 +332,14 @@ def check_round_trip(
     """Return a mask [H, W] of the pixels whose round trip through another view's inverse depth ends within ``most`` px."""
     # ``sensitivity`` [H, W], the change of depth per pixel [u/px], is lowered in place where this pair of views has a smaller
     # value.
-    agrees = torch.empty(own.shape, dtype=torch.uint8, device="cpu")
+    agrees = np.empty(own.shape, np.uint8)
     rotation, translation = geometry.relative_pose(first, second)
-    center = -geometry.matmul(rotation.T, translation[:, None])[:, 0]
-    maps = [torch.from_numpy(np.ascontiguousarray(a)) for a in (own, found, sensitivity)]
-    inputs = [
-        *maps[:2], *_between(first, second), *_between(second, first), wp.mat33d(*geometry.inverse(first.K).ravel()),
-        wp.vec3d(*center), most, math.cos(math.radians(min_parallax)), maps[2], agrees,
-    ]  # fmt: skip
-    launch.launch(check, own.size, inputs, agrees.device, cost=5)
-    return agrees.numpy().astype(bool)
+    center = wp.vec3d(*-geometry.matmul(rotation.T, translation[:, None])[:, 0])
+    ways = *_between(first, second), *_between(second, first), wp.mat33d(*geometry.inverse(first.K).ravel()), center
+    limits = most, math.cos(math.radians(min_parallax))
+    inputs = _tensors(own, found, *ways, *limits, sensitivity, agrees)
+    launch.launch(check, own.size, inputs, HOST, cost=5)
+    return agrees.astype(bool)
 
 
 # Matching costs of a plane sweep on a CPU: other images are warped by a plane's homography and correlated in windows.

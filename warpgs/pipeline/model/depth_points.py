@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from warpgs import geometry
-from warpgs.kernels.sweep import lifted_pixels, occluding
+from warpgs.kernels.sweep import Pixels, cell_means, cell_runs, focal_length, given, lifted, occluding
 from warpgs.pipeline.metrics.scores import fitted_region
 from warpgs.priors.networks import in_threads, single_threaded_opencv
 from warpgs.priors.sweep import complete
@@ -27,8 +27,6 @@ view's depth."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
 """Factors of the 2nd and the 98th percentile of known depths: the planes of a sweep lie between the two products. Few of the
 planes are at distant surfaces, many at near ones."""
-CHUNK = 2**15
-"""Number of points in one pass over cells: the arrays of a pass stay in a core's cache."""
 MIN_KNOWN = 10
 """Fewest known points of a view from which its range of depths is taken."""
 
@@ -48,91 +46,58 @@ def depth_bounds(view: View, known: np.ndarray, default: tuple[float, float]) ->
     return NEAR_FRACTION * float(low), FAR_FRACTION * float(high)
 
 
-Parts = Sequence[np.ndarray]
-"""An array in parts, such as one for each view. No large arrays are joined: first touches of memory take most of the time."""
+Parts = Sequence[Pixels]
+"""Pixels in parts, such as one for each view. Their points are never stored: first touches of memory take most of the time."""
 
 
-def merge_cells(points: Parts, widths: Parts, cell: float = 1.0) -> list[np.ndarray]:
-    """Return the number of the grid cell of each point [N, 3], int64 [N]; numbers ascend with the place, and have gaps.
+def merge_cells(parts: Parts, cell: float) -> list[np.ndarray]:
+    """Return the runs of points in one grid cell, int64 [R, 3]: where they begin and end, and the number of the cell.
 
-    Cells are ``cell`` times as wide as ``widths`` [N] [u], rounded to a power of two. Points of unequal width (far and near
-    ones) lie on grids of unequal fineness, so every cell is a few pixels wide.
+    Numbers ascend with the place, and have gaps. Cells are ``cell`` times as wide as pixels, rounded to a power of two. Points
+    of unequal width (far and near ones) lie on grids of unequal fineness, so every cell is a few pixels wide. With 0 each point
+    has a cell.
     """
-    cells = [np.zeros(len(p), np.int64) for p in points]
-    parts = [*zip(points, widths, cells)]
-    chunks = [[array[k : k + CHUNK] for array in part] for part in parts for k in range(0, len(part[0]), CHUNK)]
+    if cell == 0:
+        pixels = [np.flatnonzero(p.depths.numpy() > 0) for p in parts]
+        ends = np.cumsum([*map(len, pixels)])
+        return [np.stack([own, own + 1, np.arange(end - len(own), end)], 1) for own, end in zip(pixels, ends)]
+    rows = in_threads(lambda p: cell_runs(p, cell, np.zeros((p.depths.shape[0], 9), np.int64), (0,) * 4, (0,) * 4)[0], parts)
+    low, high = np.min([r[:, 1:5].min(0) for r in rows], 0), np.max([r[:, 5:].max(0) for r in rows], 0)
+    sides = [int(s) for s in high - low + 1]
 
-    def grid(points: np.ndarray, widths: np.ndarray) -> list[np.ndarray]:  # [N] each: the level, and three coordinates in it
-        level = np.round(np.log2(cell * widths)).astype(np.int64)
-        sizes = np.exp2(level)
-        return [level, *(np.floor(values / sizes).astype(np.int64) for values in points.T)]
+    def runs(weights: Sequence[int]) -> list[np.ndarray]:
+        return in_threads(lambda p, r: cell_runs(p, cell, r, low, weights)[1], parts, rows)
 
-    def number(points: np.ndarray, widths: np.ndarray, numbers: np.ndarray) -> None:
-        for values, least, side in zip(grid(points, widths), low, sides):
-            numbers *= side
-            numbers += values - least
-
-    if chunks:
-        # twice computed, which takes less time than the memory for all
-        bounds = in_threads(lambda chunk: [(values.min(), values.max()) for values in grid(*chunk[:2])], chunks)
-        low, high = np.min(bounds, 0)[:, 0], np.max(bounds, 0)[:, 1]
-        sides = [int(s) for s in high - low + 1]
-        if math.prod(sides) >= 2**62:  # one number for all four sorts much faster than rows do, and in the same order
-            rows = np.concatenate([np.stack(grid(*part), 1) for part in zip(points, widths)])
-            return np.split(np.unique(rows, axis=0, return_inverse=True)[1].ravel(), np.cumsum([len(p) for p in points])[:-1])
-        in_threads(lambda chunk: number(*chunk), chunks)
-    return cells
+    if math.prod(sides) < 2**62:  # one number for all four sorts much faster than rows do, and in the same order
+        return runs([math.prod(sides[k:]) for k in range(1, 5)])
+    found = [runs(weights) for weights in np.eye(4, dtype=int)]
+    places = np.stack([np.concatenate(own)[:, 2] for own in found], 1)
+    numbers = np.split(np.unique(places, axis=0, return_inverse=True)[1].ravel(), np.cumsum([*map(len, found[0])])[:-1])
+    return [np.column_stack([own[:, :2], n]) for own, n in zip(found[0], numbers)]
 
 
-def _ranks(cells: Parts) -> tuple[int, list[np.ndarray]]:
-    """Return how many numbers of cells there are, and the rank of each one's number, int64 [N]."""
+def _ranks(runs: Sequence[np.ndarray]) -> tuple[int, list[np.ndarray]]:
+    """Return how many numbers of cells there are, and the rank of each run's number, int64 [R]."""
 
-    def sort(own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # neighbouring pixels often share a cell: only the first of a run is sorted
-        firsts = np.flatnonzero(np.diff(own, prepend=own[:1] - 1))
-        numbers, ranks = np.unique(own[firsts], return_inverse=True)
-        return numbers, np.repeat(ranks, np.diff(firsts, append=len(own)))
+    def distinct(numbers: np.ndarray) -> np.ndarray:
+        numbers = np.sort(numbers, kind="stable")  # fast where parts are sorted
+        return numbers[np.diff(numbers, prepend=-1) > 0]
 
-    parts, own_ranks = zip(*in_threads(sort, cells))  # first each part, in threads, then what is left of them
-    numbers, ranks = np.unique(np.concatenate(parts), return_inverse=True)
-    return len(numbers), in_threads(np.take, np.split(ranks, np.cumsum([*map(len, parts)])[:-1]), own_ranks)
+    numbers = distinct(np.concatenate(in_threads(distinct, [own[:, 2] for own in runs])))
+    return len(numbers), in_threads(lambda own: np.searchsorted(numbers, own[:, 2]), runs)
 
 
-def merge(points: Parts, colors: Parts, cells: Parts) -> PointCloud:
-    """Return the mean point [u] and colour of every cell, in the order of the cells' numbers, which are ``cells`` [N]."""
-    count, ranks = _ranks(cells)
-    counts = sum(np.bincount(r, minlength=count) for r in ranks)
-
-    def mean(parts: Parts, channel: int) -> np.ndarray:
-        total = np.zeros(count)
-        for values, rank in zip(parts, ranks):
-            np.add.at(total, rank, values[:, channel].astype(float))
-        return total / counts
-
-    means = in_threads(mean, [points] * 3 + [colors] * 3, [0, 1, 2] * 2)
-    return PointCloud(np.stack(means[:3], 1), np.stack(means[3:], 1).astype(np.float32))
+def merge(parts: Parts, colors: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> PointCloud:
+    """Return the mean point [u] and colour of every cell, in the order of the cells' numbers; colours [..., 3] are float32."""
+    count, ranks = _ranks(runs)
+    places, shades = cell_means(count, zip(parts, [c.reshape(-1, 3) for c in colors], runs, ranks))
+    return PointCloud(places, shades.astype(np.float32))
 
 
-def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
-    """Return a mask [N], True if a point [N, 3] occludes the depths [H, W] (0 if unknown) of a view other than ``without``."""
+def in_free_space(pixels: Pixels, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
+    """Return a mask [H, W], True if a point occludes the depths (0 if unknown) of a view other than ``without``, or is none."""
     others = [j for j in range(len(views)) if j != without]
-    return occluding([views[j].camera for j in others], [depths[j] for j in others], points, FREE_SPACE)
-
-
-Lifted = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Points [N, 3] [u], colours [N, 3] and widths [N] [u] of pixels."""
-
-
-def _lift(view: View, depth: np.ndarray, where: np.ndarray) -> Lifted:
-    """Return world points [N, 3] [u], colours [N, 3] and pixel footprints [N] [u] of the pixels of a mask ``where`` [H, W]."""
-    pixels = np.flatnonzero(where)
-    z = depth.ravel()[pixels]
-    return lifted_pixels(view.camera, pixels, z), view.image.reshape(-1, 3)[pixels], z.astype(float) / focal_length(view.camera)
-
-
-def focal_length(camera: Camera) -> float:
-    """Return the geometric mean of both focal lengths [px]."""
-    return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+    return occluding([views[j].camera for j in others], [depths[j] for j in others], pixels, FREE_SPACE)
 
 
 def _tracked(points: PointCloud, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]:
@@ -167,7 +132,7 @@ def coarse_points(
     """
     regions = [fitted_region(v) for v in views]
     consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
-    *reconstructed, pixels_of = _tracked(known, views)
+    points, colors, widths, pixels_of = _tracked(known, views)
     searched = [i for i, d in enumerate(depths) if fill_px > 0 and d.searched]
 
     def completed(i: int) -> np.ndarray:
@@ -178,52 +143,42 @@ def coarse_points(
 
     filled_depths = dict(zip(searched, in_threads(completed, searched)))
 
-    def lifted(i: int) -> tuple[Lifted, Lifted | None, str]:
+    def pixels_of_view(i: int) -> tuple[Pixels, Any, str]:
         view, sure, (region, name) = views[i], consistent[i], regions[i]
         counted = np.ones_like(sure) if region is None else region
         total = max(1, counted.sum())
         text = f"{view.name}: {100 * sure.sum() / total:.0f} % of {'pixels' if region is None else f'the {name}'} by {source}"
         more = None
         if i in filled_depths:
-            rows = _lift(view, filled_depths[i], ~sure & counted & (filled_depths[i] > 0))
-            keep = ~in_free_space(rows[0], [views[k] for k in searched], list(filled_depths.values()), searched.index(i))
-            more = rows[0][keep], rows[1][keep], rows[2][keep]
-            text += f", {100 * keep.sum() / total:.0f} % filled"
-        return _lift(view, depths[i].depth, sure), more, "; ".join((text, *depths[i].notes))
+            more = lifted(view.camera, np.where(~sure & counted, filled_depths[i], 0))
+            hidden = in_free_space(more, [views[k] for k in searched], list(filled_depths.values()), searched.index(i))
+            more = lifted(view.camera, np.where(hidden, 0, filled_depths[i]))
+            text += f", {100 * (~hidden).sum() / total:.0f} % filled"
+        return lifted(view.camera, np.where(sure, depths[i].depth, 0)), more, "; ".join((text, *depths[i].notes))
 
-    known_rows, filled_rows, notes = (list(a) for a in zip(*in_threads(lifted, range(len(views)))))
-    filled_in = [rows for rows in filled_rows if rows is not None]
-    points, colors, widths = zip(*known_rows)
-    pixels, added, filled = sum(map(len, points)), NOTHING, NOTHING
-    if merge_px > 0:
-        cloud = merge(points, colors, merge_cells(points, widths, merge_px))
-        added, (new,) = _elsewhere(points, widths, *([r] for r in reconstructed), merge_px)
-        points, widths = (*points, reconstructed[0][new]), (*widths, reconstructed[2][new])
-    else:
-        cloud = PointCloud(np.concatenate(points), np.concatenate(colors))
-    if filled_in:
-        filled, _ = _elsewhere(points, widths, *zip(*filled_in), fill_px)
+    parts, filled_parts, notes = (list(a) for a in zip(*in_threads(pixels_of_view, range(len(views)))))
+    cloud, added, filled = merge(parts, [v.image for v in views], merge_cells(parts, merge_px)), NOTHING, NOTHING
+    if merge_px > 0 and len(points):
+        added, (new,) = _elsewhere(parts, [given(points, widths)], [colors], merge_px)
+        parts.append(given(points[new], widths[new]))
+    if searched:
+        filled, _ = _elsewhere(parts, [filled_parts[i] for i in searched], [views[i].image for i in searched], fill_px)
     more = f"{len(added):,} from the reconstruction, " if len(added) else ""
+    pixels = sum(int(c.sum()) for c in consistent)
     notes.append(f"{len(cloud):,} points from {pixels:,} pixels by {source}, {more}{len(filled):,} filled in")
     return joined((cloud, added, filled)), notes
 
 
-def _elsewhere(
-    points: Parts, widths: Parts, more: Parts, colors: Parts, more_widths: Parts, cell: float
-) -> tuple[PointCloud, list[np.ndarray]]:
-    """Merge points ``more`` [M, 3] in cells without ``points`` [N, 3]; return the merged points and a mask of used ones [M].
-
-    ``widths`` [N] and ``more_widths`` [M] are widths of a pixel at each point [u]; ``cell`` is the width of a cell [px].
-    """
-    if not any(map(len, more)):
-        return NOTHING, [np.zeros(0, bool) for _ in more]
-    cells = merge_cells([*points, *more], [*widths, *more_widths], cell)
-    count, ranks = _ranks(cells)
+def _elsewhere(parts: Parts, more: Parts, colors: Sequence[np.ndarray], cell: float) -> tuple[PointCloud, list[np.ndarray]]:
+    """Merge points of ``more`` parts in cells [px] without points of ``parts``; return them and masks of used points [M]."""
+    runs = merge_cells([*parts, *more], cell)
+    count, ranks = _ranks(runs)
     free = np.ones(count, bool)
-    for rank in ranks[: len(points)]:
+    for rank in ranks[: len(parts)]:
         free[rank] = False
-    alone = [free[rank] for rank in ranks[len(points) :]]
-    return merge(*([p[a] for p, a in zip(parts, alone)] for parts in (more, colors, cells[len(points) :]))), alone
+    runs, alone = runs[len(parts) :], [free[rank] for rank in ranks[len(parts) :]]
+    left = [own[a] for own, a in zip(runs, alone)]
+    return merge(more, colors, left), [np.repeat(a, own[:, 1] - own[:, 0]) for own, a in zip(runs, alone)]
 
 
 # Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
@@ -305,7 +260,7 @@ def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequenc
     rows, columns = rows[hidden], columns[hidden]
     points = geometry.back_project(view.camera, np.stack([columns, rows], 1) + 0.5, far[rows, columns].astype(float))
     image = _mean_around(view.image, BEHIND_COLOR_PX, *map(np.arange, depth.shape)).reshape(-1, 3)
-    keep = ~in_free_space(points, views, confirmed, i)
+    keep = ~in_free_space(given(points, np.ones(len(points))), views, confirmed, i)[0]
     return PointCloud(points[keep], image[source[rows, columns]][keep].astype(np.float32))
 
 
@@ -470,5 +425,8 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     colors, kept = _seen_colors(shapes, cells, width)
     total, cells, colors = len(cells), cells[kept], colors[kept]
     wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))
-    cloud = merge([cells], [colors], merge_cells([cells], [np.full(len(cells), wide)]))
+    places, shades = (given(p, np.full(len(cells), wide)) for p in (cells, colors))
+    runs = merge_cells([places], 1.0)
+    cloud, shades = (merge([p], [np.float32(colors)], runs) for p in (places, shades))
+    cloud = PointCloud(cloud.points, np.float32(shades.points))
     return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of {total:,} cells"
