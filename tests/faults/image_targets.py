@@ -257,7 +257,7 @@ WEBPS = {
     "lossy": encoded("WEBP", "RGB"), "lossless": encoded("WEBP", "RGB", lossless=True),
     "alpha": encoded("WEBP", "RGBA"), "alpha lossless": encoded("WEBP", "RGBA", lossless=True),
 }  # fmt: skip
-add("webp", WEBPS, (image_files.webp_chunks, image_files._webp_size), (webp_chunk, header))
+add("webp", WEBPS, (image_files._webp_chunks, image_files._webp_size), (webp_chunk, header))
 
 ANY = {"png": encoded("PNG", "LA"), "float": encoded("TIFF", "F"), "double": by_opencv(".tif", COLORS[..., 0] / 255.0)}
 ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P"), "avif": encoded("AVIF", "RGBA"), "webp": WEBPS["alpha"]}
