@@ -23,9 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTALL = "docs/install.md"
-FENCE = re.compile(
-    r"(?:<!-- docs-run: (?P<reason>[^\n]*?) -->\s*\n)?^```(?P<kind>[^\n`]*)\n(?P<code>.*?)^```", re.DOTALL | re.MULTILINE
-)
+FENCE = re.compile(r"(?:<!-- docs-run: (?P<reason>[^\n]*?) -->\s*\n)?^```(?P<kind>[^\n`]*)\n(?P<code>.*?)^```", re.S | re.M)
 SHELLS = {"bash", "sh", "shell", "console"}
 PROGRAMS = ("warpgs ", "pip ", "ssh ", "make ", "python ", "git ")
 """First words that mark a block without a language as one for a shell."""
@@ -53,31 +51,23 @@ END
 """
 LIMITS = {
     "demo": {"--width": "96", "--height": "72"}, "fit": {"--steps": "40"}, "farm": {"--steps": "40"},
-    "render": {"--frames": "4"},
-    "compare": {"--steps": "20", "--seeds": "1", "--downscale": "1"}, "view": {"--port": "0"},
+    "render": {"--frames": "4"}, "compare": {"--steps": "20", "--seeds": "1", "--downscale": "1"}, "view": {"--port": "0"},
     "ablate": {"--steps": "20", "--seeds": "1", "--downscale": "1"},
 }  # fmt: skip
 """Largest values of flags by command; a flag is set to its value if a page gives no value or a larger one."""
-TIME = 900
-"""Time limit of a block [s]."""
-VIEWER_TIME = 300
-"""Time limits for the viewer to print its address, and to end [s]; on a busy machine it first finishes an image."""
+TIME, VIEWER_TIME = 900, 300
+"""Time limits of a block, and of the viewer to print its address, or to end [s]; on a busy machine it finishes an image."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block of commands, or of Python, in a page."""
+    """A block of a page, its first line, and what does not run: lines, or the first line for all, each with its reason."""
 
     page: str
-    """Path of the page from the root of the project."""
     line: int
-    """Line of the page with the first command."""
     code: str
-    """Code to run, for bash or for Python."""
     python: bool
-    """True for Python."""
     left_out: tuple[tuple[str, str], ...]
-    """Lines that do not run, or the first line of a block that does not run, each with its reason."""
 
 
 def pages() -> list[str]:
