@@ -201,7 +201,6 @@ ELSEWHERE = {
     ("process.py", "open wb"): "the null device",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("poses/matching.py", "savez"): "into the file of `replacing`",
-    ("report/images.py", "save"): "Pillow, into memory",
     ("report/film.py", "save"): "the same",
     ("export/sog.py", "save"): "the same",
     ("export/meshes_and_cameras.py", "save"): "the same",

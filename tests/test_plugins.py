@@ -143,7 +143,7 @@ def test_a_run_continues_with_the_code_that_it_began_with(tmp_path):
     check_same(same | {"own_code": {"mine": "a"}}, same | {"own_code": {"mine": "a"}}, tmp_path)
     check_same(same | {"own_code": {}}, same, tmp_path)  # of a version that did not record it
     for now, then in (({"mine": "a"}, {"mine": "b"}), ({"mine": "a"}, {}), ({}, {"mine": "a"})):
-        with pytest.raises(UsageError, match="the code of mine has changed since the run in"):
+        with pytest.raises(UsageError, match=r"--resume: your own code \(mine\) differs from the run in"):
             check_same(same | {"own_code": now}, same | {"own_code": then}, tmp_path)
 
 

@@ -405,7 +405,8 @@ class Group(Ranks):
 def _number(name: str, least: int, most: int, default: str | None = None) -> int:
     text = os.environ.get(name, default)
     if text is None or not text.isdecimal() or not least <= int(text) <= most:
-        raise UsageError(f"the variable {name} must be a whole number from {least} to {most}, not {text!r}; use torchrun")
+        fix = "start the fit with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
+        raise UsageError(f"the environment variable {name} must be a whole number from {least} to {most}, not {text!r}; {fix}")
     return int(text)
 
 
@@ -439,7 +440,9 @@ def join(device: str) -> Ranks:
     agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # torchrun itself holds the store then
     cuda = device != "cpu" and (device.startswith("cuda") or torch.cuda.is_available())
     home = _stay_home(address)
-    with explained(f"rank {rank} of {count} cannot reach {address}:{port}", "start them all", RuntimeError, kind=ResourceError):
+    with explained(
+        f"rank {rank} of {count} cannot reach {address}:{port}", "start all ranks", RuntimeError, kind=ResourceError
+    ):
         store = _store(address, port, count, home, hosts=rank == 0 and not agent)
         watch = RankWatch(rank, count, store, _store(address, port, count, home, hosts=False))
     backend = "nccl" if cuda else "gloo"

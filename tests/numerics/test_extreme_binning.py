@@ -61,10 +61,10 @@ def test_full_screen_gaussians_at_4k_are_listed(device):
 
 
 def test_counts_and_sizes_beyond_their_bits_are_refused(device):
-    """140,000 Gaussians over all tiles of 8K, more instances than a packed sum holds: both numbers are right in the error."""
+    """140,000 Gaussians over all tiles of 8K, more instances than a packed sum holds: their number is right in the error."""
     projected = torch.zeros(1, 140_000, 12, device=device)
     counts = torch.full((1, 140_000), 518_400, dtype=torch.int32, device=device)
-    with pytest.raises(ResourceError, match=r"140,000 visible .* 518400 of 518400 tiles .* 72,576,000,000"):
+    with pytest.raises(ResourceError, match=r"72,576,000,000 .Gaussian, tile. instances need 9.8 TiB"):
         bin_tiles(projected, counts, width=7680, height=4320, tile_size=8, rule=EXACT)
     # an axis, a launch and a number of tiles that would wrap around
     huge = torch.zeros(1, device=device).expand(2**31)
@@ -74,7 +74,7 @@ def test_counts_and_sizes_beyond_their_bits_are_refused(device):
         launch.launch(None, 2**31, [], device)
     launch._check_size(2**31 - 1)
     projected, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
-    with pytest.raises(ResourceError, match=r"2,147,483,648 tiles.* fewer cameras"):
+    with pytest.raises(ResourceError, match="have too many tiles; render fewer at once"):
         bin_tiles(projected, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
 
 

@@ -403,7 +403,7 @@ def test_a_sheet_per_training_view(scene, tmp_path, capsys):
     sheet = cv2.imread(str(sheets[0]))
     assert sheet.shape[1] > 1500 and sheet.std() > 20
     assert main(show(scene, "--out", tmp_path / "b", *flags)) == 0
-    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps were read from the cache" in capsys.readouterr().out
+    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps read from the cache" in capsys.readouterr().out
     for path in sheets:
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b" / path.name)), cv2.imread(str(path)))
 
@@ -414,7 +414,7 @@ def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys, 
     """Depth comes from the other views, and some of it is confirmed in every one."""
     assert main(show(scene, "--out", tmp_path / "a", "--source", source)) == 0
     text = capsys.readouterr().out
-    assert "semantics: no network, so saliency is used as foreground" in text and "held out" not in text
+    assert "semantics: saliency as foreground" in text and "held out" not in text
     assert "depth: from the other views, " in text and "no consistent depth" not in text
     assert not (tmp_path / "cache").exists()
 

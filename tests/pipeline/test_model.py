@@ -390,10 +390,10 @@ def test_convert_says_what_it_did(tmp_path):
     lines = convert(tmp_path / "a.ply", tmp_path / "b.spz", Filters(sh_degree=1))
     assert any("removed Gaussians: 1 larger than the scene (--no-clean" in line for line in lines)
     assert any("above degree 1 are left out (--sh-degree)" in line for line in lines)
-    assert any("SPZ files have y up" in line for line in lines)
+    assert any("SPZ has y up" in line for line in lines)
     assert "99 Gaussians in" in lines[-1] and read_gaussians(tmp_path / "b.spz").sh.shape == (99, 4, 3)
     lines = convert(tmp_path / "b.spz", tmp_path / "c.ply", Filters(crop="-1,-1,3,1,1,5", rotate="0,0,1,180"))
-    assert "SPZ files have y up" in lines[0]
+    assert "SPZ has y up" in lines[0]
     assert not any("removed" in line for line in lines) and any("rotated by 180.0 degrees" in line for line in lines)
     assert float(read_gaussians(tmp_path / "c.ply").means[:, :2].abs().max()) <= 1
     convert(tmp_path / "a.ply", tmp_path / "d.ply")

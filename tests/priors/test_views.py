@@ -255,7 +255,7 @@ def test_pinholes_stay_and_parallel_rays_are_refused():
     view = View("a.png", dataclasses.replace(cam, model="pinhole"), np.zeros((6, 8, 3), np.float32))
     depth = ViewDepth(*(np.zeros((6, 8), t) for t in (np.float32, bool, np.float32)))
     assert pinhole_view(view) is view and lens_depth(view.camera, depth) is depth
-    with pytest.raises(UsageError, match="camera model 'orthographic': start from points"):
+    with pytest.raises(UsageError, match=r"no depth for 'orthographic' cameras: give --init.source points"):
         pinhole_view(dataclasses.replace(view, camera=cam))
 
 

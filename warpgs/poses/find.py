@@ -289,8 +289,9 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
     with explained(f"{source} or {out}: cannot be read", "choose other folders", kind=UsageError):
         if not photos.is_video(source):
             if not source.is_dir():
-                what = "is neither" if source.exists() else "does not exist"
-                raise DataError(f"{source}: {what}; give a folder of photographs, or a video (mp4, mov, m4v, avi, mkv, webm)")
+                there = files.NOT_REGULAR if source.exists() else "does not exist"
+                what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
+                raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
             if other := _something_else(source):
                 raise UsageError(f"{source}: {other}")
             if not photos.photographs_inside(source, allow_outside):

@@ -274,7 +274,8 @@ def mesh(
 
     def planned(plan: GridPlan, memory: str) -> None:
         size = f"{' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {_unit(run)}"
-        say(f"grid: {size}; {1 - plan.inside:.1%} of the observed surface is outside the grid and left out")
+        lost = f"; {1 - plan.inside:.1%} of the observed surface is outside the grid and left out"
+        say(f"grid: {size}{lost * (plan.inside < 0.9995)}")
 
     ahead = _ahead(run)
     with hold_file(target) as notes:
