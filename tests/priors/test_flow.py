@@ -11,6 +11,7 @@ from tests.priors import networks as nw
 from tests.priors.rigs import rig, still_life, write_flo
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import back_project, project_points
+from warpgs.priors import flow as flows
 from warpgs.priors.flow import (
     _ratio_matches,
     epipolar_depth,
@@ -239,7 +240,7 @@ def test_files_that_are_no_flow_network(tmp_path):
 
 
 @pytest.mark.parametrize(("first", "second"), [(2, 2), (31, 33), (64, 1), (100, 65)])
-def test_matches_pass_lowes_test_of_exact_distances(first, second):
+def test_matches_pass_lowes_test_of_exact_distances(first, second, device):
     generator = np.random.default_rng(first)
     a, b = (generator.integers(0, 256, (n, 128)).astype(np.uint8) for n in (first, second))
     a[: len(b) // 2] = np.clip(b[: len(b) // 2][: len(a)].astype(int) + generator.integers(-9, 9), 0, 255)[: len(a)]
@@ -248,4 +249,9 @@ def test_matches_pass_lowes_test_of_exact_distances(first, second):
     order = np.argsort(squares, axis=1, kind="stable")
     wanted = [(i, o[0]) for i, o in enumerate(order) if len(b) > 1 and squares[i, o[0]] < 0.64 * squares[i, o[1]]]
     assert len(wanted) >= (len(b) > 1) and _ratio_matches(a, b).tolist() == [list(map(int, w)) for w in wanted]
+    if len(b) > 1:  # on any device, also where not all fit at a time
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(flows, "AT_ONCE", 40 * len(b))
+            patch.setattr(flows, "_two_nearest", lambda a, b: flows._two_nearest_cuda(a, b, device))
+            assert _ratio_matches(a, b).tolist() == [list(map(int, w)) for w in wanted]
     assert _ratio_matches(a, None).shape == _ratio_matches(a[:1], b).shape == (0, 2)

@@ -39,8 +39,8 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
 def scene_of(a: Any, path: str) -> SceneRequest:
     """Return the request for a scene folder from parsed flags; a user-defined reader is loaded."""
     asked = flags.settings_of(SceneRequest, a)
-    if asked.downscale is not None and asked.downscale < 1:
-        raise UsageError(f"--downscale must be at least 1, not {asked.downscale}")
+    if asked.downscale is not None and not 1 <= asked.downscale < 2**31:
+        raise UsageError(f"--downscale must be a number from 1 to 2,147,483,647, not {asked.downscale}")
     if asked.reader is not None:
         READERS.load(asked.reader)
     named = {n: getattr(asked, n) for n in ("score_masks", "matcher", "depths", "normals")}

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
@@ -20,6 +21,7 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 # parallax, a position inside the image, and the round trip of the flow. The sensitivity of depth to the match is the
 # true derivative. Derivation: docs/flow_epipolar.md.
 
+CPU = torch.device("cpu")
 MAX_RESIDUAL = 1.0
 """Largest distance of a match from its epipolar line [px] (NexusGS)."""
 MAX_ROUND_TRIP = 1.5
@@ -169,6 +171,8 @@ MIN_ANGLE = 1.0
 """Smallest angle between the two rays [deg]; below it depth is noise."""
 MAX_PAIRS = 30
 """Largest number of pairs of views that are matched, nearest first."""
+MANY, AT_ONCE = 2**30, 2**24
+"""Number of comparisons of descriptors from which a GPU does them, and number that it does at a time."""
 PIXELS_AT_ONCE = 16_000_000
 """Number of pixels of the images whose features are found at a time; SIFT takes about 250 bytes of memory a pixel."""
 
@@ -198,15 +202,17 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
     return pixels, None if descriptors is None else descriptors.astype(np.uint8)
 
 
-def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray:
-    """Return the rows [N, 2] of descriptors, uint8 [K, 128], that match by Lowe's test."""
-    if first is None or second is None or min(len(first), len(second)) < 2:
-        return np.zeros((0, 2), int)
-    # whole numbers below 2^24 are exact in float32, in any order of additions
-    others, pairs = np.zeros((-(-len(second) // BLOCK), BLOCK, second.shape[1]), np.float32), []
+# Whole numbers below 2^24 are exact in float32, in any order of additions: squared distances are the same on every device. A
+# nearest descriptor that is not alone fails Lowe's test, whichever of the equal ones is found.
+
+
+def _two_nearest(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nearest of the second descriptors to each first one [N], and squared distances to the nearest two [2, N]."""
+    others = np.zeros((-(-len(second) // BLOCK), BLOCK, second.shape[1]), np.float32)
     others.reshape(-1, second.shape[1])[: len(second)] = second
     others_squared = np.square(others).sum(-1).ravel()
     others_squared[len(second) :] = np.inf
+    found = []
     for start in range(0, len(first), BLOCK):
         block = first[start : start + BLOCK].astype(np.float32)
         products = np.matmul(-2 * block, others.transpose(0, 2, 1))  # a block of the others after the other
@@ -214,17 +220,34 @@ def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None) -> np.nd
         best = squares.argmin(1)
         nearest = squares[rows, best]
         squares[rows, best] = np.inf
-        distances = np.sqrt(np.stack([nearest, squares.min(1)]) + np.square(block).sum(-1)).astype(float)
-        matched = np.flatnonzero(distances[0] < MATCH_RATIO * distances[1])
-        pairs.append(np.stack([start + matched, best[matched]], 1))
-    return np.concatenate(pairs)
+        found.append((best, np.stack([nearest, squares.min(1)]) + np.square(block).sum(-1)))
+    return np.concatenate([best for best, _ in found]), np.concatenate([squares for _, squares in found], 1)
+
+
+def _two_nearest_cuda(first: np.ndarray, second: np.ndarray, device: torch.device) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `_two_nearest` does, on a GPU."""
+    a, b = (torch.from_numpy(d).to(device, torch.float32) for d in (first, second))
+    parts, others = a.split(max(1, AT_ONCE // len(b))), b.square().sum(1)
+    found = [torch.addmm(others, part, b.T, alpha=-2).topk(2, largest=False) for part in parts]
+    squares = torch.cat([values for values, _ in found]) + a.square().sum(1, keepdim=True)
+    return torch.cat([ids[:, 0] for _, ids in found]).cpu().numpy(), squares.T.cpu().numpy()
+
+
+def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None, device: torch.device = CPU) -> np.ndarray:
+    """Return the rows [N, 2] of descriptors, uint8 [K, 128], that match by Lowe's test."""
+    if first is None or second is None or min(len(first), len(second)) < 2:
+        return np.zeros((0, 2), int)
+    best, squares = _two_nearest_cuda(first, second, device) if device.type == "cuda" else _two_nearest(first, second)
+    distances = np.sqrt(squares).astype(float)
+    matched = np.flatnonzero(distances[0] < MATCH_RATIO * distances[1])
+    return np.stack([matched, best[matched]], 1)
 
 
 def agreeing_matches(
-    a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE
+    a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE, device: torch.device = CPU
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match two views' features; return rows [N, 2] and points [N, 3] [u] of matches that agree with the poses."""
-    ids = _ratio_matches(first[1], second[1])
+    ids = _ratio_matches(first[1], second[1], device)
     found, good = _triangulate(a, b, first[0][ids[:, 0]], second[0][ids[:, 1]], min_angle)
     return ids[good], found[good]
 
@@ -251,15 +274,23 @@ def _triangulate(a: View, b: View, at_a: np.ndarray, at_b: np.ndarray, min_angle
     return points, good
 
 
-def triangulate_matches(views: list[View]) -> PointCloud:
-    """Return points [u] of SIFT matches (Lowe 2004) that agree with the known poses, with the pixels' colours."""
+def triangulate_matches(views: list[View], device: Callable[[], torch.device] = lambda: CPU) -> PointCloud:
+    """Return points [u] of SIFT matches (Lowe 2004) that agree with the known poses, with the pixels' colours.
+
+    Many features are compared on the ``device``, if it is a GPU; the result is the same.
+    """
     centers = [v.camera.center for v in views]
     pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]]))
     pairs = pairs[:MAX_PAIRS]
     chosen = sorted({i for pair in pairs for i in pair})
     most = max(1, PIXELS_AT_ONCE // max((v.camera.width * v.camera.height for v in views), default=1))
     features = dict(zip(chosen, in_threads(lambda i: sift_features(views[i]), chosen, most=most)))
-    matched = in_threads(lambda p: agreeing_matches(*(views[i] for i in p), *(features[i] for i in p)), pairs)
+    own = device() if sum(len(features[i][0]) * len(features[j][0]) for i, j in pairs) > MANY else CPU
+
+    def match(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        return agreeing_matches(*(views[i] for i in pair), *(features[i] for i in pair), device=own)
+
+    matched = in_threads(match, pairs)
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)]
     for (i, _), (ids, found) in zip(pairs, matched):
         at = features[i][0][ids[:, 0]].astype(int)

@@ -196,7 +196,7 @@ def consistent_depths(
             between = flow_between(views, config.flow)
             return [flow_depth(views, i, between) for i in range(len(views))]
     with section("matches"):
-        points = np.concatenate([known.points, triangulate_matches(views).points])
+        points = np.concatenate([known.points, triangulate_matches(views, device).points])
     bounds = [depth_points.depth_bounds(v, points, camera_depths(views)) for v in views]
     with section("depth"):
         return sweep_depths(views, bounds, device(), lambda n, of: progress(f"finding depth: {n} of {of} views"))
