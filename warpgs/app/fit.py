@@ -40,7 +40,7 @@ def scene_of(a: Any, path: str) -> SceneRequest:
     """Return the request for a scene folder from parsed flags; a user-defined reader is loaded."""
     asked = flags.settings_of(SceneRequest, a)
     if asked.downscale is not None and not 1 <= asked.downscale < 2**31:
-        raise UsageError(f"--downscale must be a number from 1 to 2,147,483,647, not {asked.downscale}")
+        raise UsageError(f"--downscale must be at least 1, and below 2^31, not {asked.downscale}")
     if asked.reader is not None:
         READERS.load(asked.reader)
     named = {n: getattr(asked, n) for n in ("score_masks", "matcher", "depths", "normals")}
@@ -215,6 +215,8 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     scene = scene_of(a.reading, a.reading.path)
     view_port = _machine(a)
     config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
+    if config.steps is not None and config.steps >= 2**31:
+        raise UsageError(f"--steps must be below 2^31, not {config.steps}")
     if a.time_budget is not None:
         if a.resume or flags.word_after(arguments, "--steps"):
             raise UsageError("--time-budget chooses the steps; leave out --steps. To continue, give only --out RUN --resume")

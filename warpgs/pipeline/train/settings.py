@@ -46,7 +46,7 @@ class FitConfig(Checked):
     preset: str = "3dgs"
     """Preset that the other settings start from: a name, a .toml file of settings, or your own FitConfig or mapping as
     module:NAME or path/to/file.py:NAME."""
-    steps: Annotated[int | None, Within(1, 2**31 - 1)] = 7000
+    steps: Annotated[int | None, Within(1)] = 7000
     """Number of optimisation steps; early stopping may end the fit sooner. None: chosen by the number of views."""
     max_steps: Annotated[int, Within(1)] = 30_000
     """Largest number of steps that is chosen by the number of views."""
