@@ -348,6 +348,9 @@ def value(config: FitConfig, name: str):
         (10, OPAQUE, "cpu", {}, {MEANS: 4e-4, SH: 6.25e-3}),
         *((n, OPAQUE, d, {}, {GAIN: gain}) for n in (3, 12) for d, gain in (("cpu", 0.0), ("cuda", 0.1))),
         (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1, "sh_every": 500}),
+        # nor where views have half size until growth ends, since nothing could end it
+        *((n, OPAQUE, "cuda", {"preset": "quick"}, {GAIN: 0.0, "sh_every": every}) for n, every in ((3, 500), (40, 20))),
+        *((12, OPAQUE, "cuda", {"steps": 1000, "half_resolution": h}, {GAIN: g}) for h, g in ((0.7, 0.0), (0.69, 0.1))),
     ],
 )  # fmt: skip
 def test_settings_are_chosen_by_the_views(views, view, device, given, wanted):

@@ -515,7 +515,8 @@ AVERAGED_VIEWS = 20
 (docs/decisions/029-mean-of-the-last-steps.md)."""
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
-too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
+too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md); nor if views have half size
+until growth ends anyway."""
 CPU_SECONDS = 3.0, 5.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
 CPU_TIMES = 0.002, 6.8e-8, 3.3e-7, 1.3e-8
@@ -641,6 +642,8 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         asked = dataclasses.replace(config, steps=wanted, half_resolution=half, sh_degree=degree, method=method)
         steps, most, limit = limited_on_cpu(asked, views, pixels)
     limited = steps < wanted
+    phases = plan_phases(config.phases, steps)
+    whole = limited or half * steps >= phases.stable_start  # a fit that nothing can end early holds nothing out
     init = config.init
     if init.extrapolate is None:
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
@@ -654,12 +657,12 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         "average_last": AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0,
     }  # fmt: skip
     rates = {n: given(getattr(config.optimizer, n), float(f"{v:.3g}")) for n, v in rates.items()}
-    if limited and degree and config.stopping.min_gain_db is None:
+    if whole and degree and config.stopping.min_gain_db is None:
         # as with held-out blocks, all degrees are in use when growth begins
-        sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
+        sh_every = min(sh_every, max(1, phases.refine // degree))
     smooth, few = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
     smooth = given(config.loss.smooth_weight, smooth if views <= few and steps >= SMOOTH_STEPS else 0.0)
-    min_gain = given(config.stopping.min_gain_db, 0.0 if limited else MIN_GAIN_DB)
+    min_gain = given(config.stopping.min_gain_db, 0.0 if whole else MIN_GAIN_DB)
     made = dataclasses.replace(
         config, steps=steps, max_gaussians=most, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init,
         optimizer=dataclasses.replace(config.optimizer, **rates), method=dataclasses.replace(config.method, hier=hier),
