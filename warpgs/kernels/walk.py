@@ -203,10 +203,12 @@ def make_weights(real, tile_size: int):
             weights[slot, 0] = total
             weights[slot, 1] = largest
             instance += 1
-            if instance % strip == 0:
+            if instance % ahead == 0:
                 left_open = int(0)
-                for p in range(side * side):
-                    left_open += wp.where(t[p] >= settings.stop, 1, 0)
+                for row in range(side):
+                    base = wp.max(row * side, 0)
+                    for column in range(side):
+                        left_open += wp.where(t[base + column] >= settings.stop, 1, 0)
 
     return weigh
 
