@@ -42,12 +42,12 @@ def written(suffix: str):
     return prepare
 
 
-def add(name: str, suffix: str, parser: tuple, changes: tuple[Change, ...], prepare=None, repair=None) -> None:
+def add(name: str, suffix: str, parser: tuple, changes: tuple[Change, ...], prepare=None, repair=None, lines=0.9) -> None:
     """Register the reader of a format of Gaussians."""
     register(
         Target(
             name, prepare or written(suffix), lambda root, path: base.read_gaussians(path), (*parser, gaussians_of),
-            changes, repair, nonsense,
+            changes, repair, nonsense, lines=lines,
         )
     )  # fmt: skip
 
@@ -120,7 +120,7 @@ SPZ_CHANGES = (
     inside_gzip(damage),
     spz_streams,
 )
-add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files)
+add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files, lines=0.85)
 
 
 def side_files(root: Path) -> list[Path]:

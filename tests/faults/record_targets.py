@@ -143,7 +143,7 @@ FOUND = {
 add(
     "record of poses", poses_record.JSON, FOUND,
     lambda root, path: poses_record.report_lines(poses_record.read_poses_record(root)),
-    (poses_record.read_poses_record, poses_record.report_lines, schema.items),
+    (poses_record.read_poses_record, poses_record.report_lines, schema.items), lines=0.85,
 )  # fmt: skip
 
 

@@ -38,7 +38,7 @@ COMMANDS = (
 """The commands that are killed; ``worker`` is a farm whose jobs run in its own process, so that their calls are seen."""
 NEEDS = {"view": "viser", "poses": "pycolmap"}
 """Modules that a command needs and that may be missing."""
-SAME_BYTES = (".ply", ".spz", ".glb", ".png", ".jpg", ".mp4", ".safetensors")
+SAME_BYTES = (".ply", ".spz", ".glb", ".png", ".jpg", ".webp", ".mp4", ".safetensors")
 """Suffixes of files that are the same whenever they are written again; the others hold times and places."""
 
 TEXTS = (".txt", ".md", ".csv", ".tex", ".svg")
@@ -180,7 +180,8 @@ def check_whole(folder: Path, *, ended: bool) -> None:
     whole = {
         ".json": lambda p: json.loads(p.read_text("utf-8")) is not None, ".jsonl": lambda p: check_log(p, ended),
         ".png": lambda p: cv2.imdecode(np.fromfile(p, np.uint8), cv2.IMREAD_UNCHANGED) is not None,
-        ".jpg": lambda p: cv2.imread(str(p)) is not None, ".mp4": lambda p: _decoded_sizes(p) == [(48, 36)] * FRAMES,
+        **dict.fromkeys((".jpg", ".webp"), lambda p: cv2.imread(str(p)) is not None),
+        ".mp4": lambda p: _decoded_sizes(p) == [(48, 36)] * FRAMES,
         ".ply": lambda p: len(read_ply(p)), ".spz": lambda p: len(read_gaussians(p)), ".bin": lambda p: p.stat().st_size,
         ".glb": lambda p: int.from_bytes(p.read_bytes()[8:12], "little") == p.stat().st_size,
         ".safetensors": lambda p: load_checkpoint(p.parent),
