@@ -193,8 +193,6 @@ FIXES = {errno.ENOENT: "create its folder", errno.EACCES: "change its permission
 """What to do about an error, other than to free disk space."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
 """Errors of file systems that cannot sync a folder."""
-DESCRIPTORS = Path("/proc/self/fd")
-"""Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
 
 @contextlib.contextmanager
@@ -225,8 +223,7 @@ def replacing(
         open_folder(path.parent) as folder,
         temporary_file(folder, suffix) as (name, file),
     ):
-        shown = DESCRIPTORS / str(folder.descriptor)  # a path that libraries can use, where the system has such paths
-        reachable = (shown if folder.descriptor is not None and shown.is_dir() else folder.path) / name
+        reachable = folder.reachable() / name
         yield file, reachable
         file.flush()
         os.fsync(file.fileno())

@@ -33,6 +33,8 @@ WINDOWS = sys.platform == "win32"
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 JUNCTION = 0xA0000003
 """Tag of Windows for a folder that leads elsewhere."""
+DESCRIPTORS = Path("/proc/self/fd")
+"""Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
 
 class RefusedError(OSError):
@@ -71,6 +73,11 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
         """Close the descriptor."""
         if self.descriptor is not None:
             os.close(self.descriptor)
+
+    def reachable(self) -> Path:
+        """Return a path of this folder in ASCII, for libraries of this process, where the system has such paths."""
+        shown = DESCRIPTORS / str(self.descriptor)
+        return shown if shown.is_dir() else self.path
 
     def _name(self, name: str) -> str:
         return name if self.descriptor is not None else str(self.path / name)
