@@ -178,11 +178,6 @@ def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def unread_reason(error: Exception) -> str:
-    """Return why a file could not be read, in words for the middle of a message."""
-    return getattr(error, "strerror", None) or str(error)
-
-
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 UNDECODABLE = re.compile("[\udc80-\udcff]")

@@ -356,7 +356,10 @@ def test_a_deleted_working_folder_is_named(program, tmp_path):
     words = ["sh", "-c", 'rmdir "$PWD"; exec "$@"', "sh", sys.executable, "-P", *program, "fit", "scene", "--out", "run"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     done = subprocess.run(words, cwd=gone, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    assert (done.returncode, done.stderr) == (2, "warpgs: the current folder was deleted; change to another one\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"warpgs: the current folder was deleted ({os.strerror(errno.ENOENT)}); change to another one\n",
+    )
 
 
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):

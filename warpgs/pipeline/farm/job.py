@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, get_type_hints
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, explained
 from warpgs.files import input_digest, read_file, write_json
 from warpgs.io.folder import READERS, all_readers
 from warpgs.pipeline.run.folder import CONFIG
@@ -61,10 +61,9 @@ def job_of(text: str) -> FarmJob:
     if scene.reader is not None:
         READERS.load(scene.reader)
     for place in v["own_code"]:  # a class of a preset's file cannot be imported by its name
-        try:
+        fix = "put it where all processes can import it"
+        with explained(f"your code {place} cannot be imported", fix, (ImportError, OSError), UsageError):
             module_of(place)
-        except (ImportError, OSError) as e:
-            raise UsageError(f"your code {place} cannot be imported ({e}); put it where all processes can import it") from e
     STRATEGIES.load(config["strategy"])
     for registry, key in ((LOSS_TERMS, "loss_terms"), (VIEW_MODULES, "view_modules")):
         for part in config[key]:
@@ -155,13 +154,11 @@ def _read(path: Path) -> list[ListedJob]:
     for number, line in enumerate(data.splitlines(), 1):
         if not line.strip():
             continue
-        try:
+        with explained(f"{path}, line {number}: not a job", 'write {"scene": FOLDER, "steps": 500}', schema.SchemaError):
             values = schema.parse(line)
             _LINE(values, "")
             scene = Path(os.path.abspath(path.parent / values.pop("scene")))
             found.append((values.pop("name", scene.name), scene, tuple(_flag(key, value) for key, value in values.items())))
-        except schema.SchemaError as e:
-            raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
     return found
 
 

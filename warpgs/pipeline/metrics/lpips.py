@@ -13,8 +13,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from warpgs.errors import DataError, UsageError
-from warpgs.files import open_input, read_tensors, remove_leftovers, tensor_pieces, unread_reason, write_bytes
+from warpgs.errors import DataError, UsageError, explained
+from warpgs.files import open_input, read_tensors, remove_leftovers, tensor_pieces, write_bytes
 
 FORMAT = "warpgs-lpips-1"
 TAP = ("tap",)
@@ -91,18 +91,12 @@ HEADS = {
 
 def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     """Return the tensors of a .pth file by name, and the file's SHA-256."""
-    try:
-        file = open_input(path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
-    with file:
-        try:
-            _check_unpacked(file)
-            # weights_only: tensors and plain containers, nothing that could run
-            state = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception as e:  # torch, pickle and zipfile raise a dozen types on malformed files
-            reason = f"{type(e).__name__}: {str(e).partition(os.linesep)[0][:120]}"
-            raise DataError(f"{path}: cannot be read as a torch state dict ({reason}); download it again") from e
+    # torch, pickle and zipfile raise a dozen types on malformed files
+    fix = "download it again, and give a .pth file with a state dict"
+    with explained(f"{path}: cannot be read as a torch state dict", fix, Exception), open_input(path) as file:
+        _check_unpacked(file)
+        # weights_only: tensors and plain containers, nothing that could run
+        state = torch.load(file, map_location="cpu", weights_only=True)
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if not isinstance(state, dict):

@@ -12,8 +12,8 @@ import torch
 
 from warpgs import schema
 from warpgs.constants import ALPHA_CUT
-from warpgs.errors import DataError, UsageError
-from warpgs.files import read_input, unread_reason
+from warpgs.errors import UsageError, explained
+from warpgs.files import read_input
 from warpgs.geometry import matmul
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.limits import NEEDLE, ROUNDING, long_axes
@@ -130,11 +130,10 @@ BOX = schema.fields({"center": _THREE, "size": _THREE}, {"rotation": schema.item
 def box_of(text: str) -> Box:
     """Return the box of a text: least and largest corner, x,y,z,X,Y,Z; or a .json file, as the viewer saves it."""
     if text.lower().endswith(".json"):
-        try:
+        fix = "save the box again in the viewer"
+        with explained(f"{text}: cannot be read as a box", fix, (OSError, schema.SchemaError)):
             values = schema.parse(read_input(Path(text), MAX_BOX_BYTES))
             BOX(values, "the box")
-        except (OSError, schema.SchemaError) as e:
-            raise DataError(f"{text}: cannot be read as a box ({unread_reason(e)}); save the box again in the viewer") from e
         center, size = np.array(values["center"], np.float64), np.array(values["size"], np.float64)
         rotation = np.array(values.get("rotation", np.eye(3)), np.float64)
     else:

@@ -1,7 +1,5 @@
 """The Gaussians of a fit with their statistics, and the model file that keeps them."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -14,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, explained
 from warpgs.files import read_tensors, tensor_pieces, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
@@ -140,7 +138,7 @@ class Table:
         return self.count
 
     @staticmethod
-    def of_gaussians(gaussians: Gaussians, columns: Mapping[str, Column]) -> Table:
+    def of_gaussians(gaussians: Gaussians, columns: Mapping[str, Column]) -> "Table":
         """Return the table of a set of Gaussians."""
         return Table(gaussians.tensors(), columns, gaussians.means.device, len(gaussians))
 
@@ -471,12 +469,11 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     tensors, header, _ = read_tensors(path, "check the path and its permissions", "write it again with warpgs.save")
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
-    try:
+    fix = "write it again with warpgs.save"
+    with explained(f"{path}: its header is damaged", fix, (KeyError, ValueError, UsageError)):
         units, names = header["units"], header.keys() - {"format", "version", "units"}
         SIMILARITY(similarity := {n: schema.parse(header[n]) for n in names}, "normalization")
         normalization = checked_normalization(similarity_of(similarity, str(path)), units, str(path))
-    except (KeyError, ValueError, UsageError) as e:
-        raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
     gaussians = checked_gaussians(tensors, str(path)).to(device)
     return Model(convert_gaussians(gaussians, normalization, units, "scene"), normalization)
 
@@ -487,10 +484,8 @@ def checked_gaussians(tensors: Tensors, where: str) -> Gaussians:
     if missing := [n for n in names if n not in tensors]:
         raise DataError(f"{where}: {', '.join(missing)} missing; restore the file, or write it again")
     gaussians = Gaussians(**{n: tensors[n] for n in names})
-    try:
+    with explained(f"{where}: damaged", "restore the file, or write it again", (TypeError, ValueError)):
         _check_values(gaussians, where)
-    except (TypeError, ValueError) as e:
-        raise DataError(f"{where}: {e}; restore the file, or write it again") from e
     return gaussians
 
 

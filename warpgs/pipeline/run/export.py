@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs.device import format_bytes
-from warpgs.errors import DataError, UsageError, listed
+from warpgs.errors import DataError, UsageError, explained, listed
 from warpgs.export.base import Format, find_format, format_of, origin_of, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
 from warpgs.geometry import convert_box, convert_camera, convert_gaussians, convert_points, matmul, rotate
@@ -125,10 +125,8 @@ def rotation_of(wish: str | None, up: np.ndarray | None) -> np.ndarray | None:
         if up is None:
             raise UsageError("--rotate level needs the cameras of a run that agree on an upward direction; give x,y,z,degrees")
         return edit.levelling(up)
-    try:
+    with explained(f"--rotate {wish[:60]}: not four numbers", "give x,y,z,degrees, or level", ValueError, UsageError):
         x, y, z, degrees = map(float, wish.split(","))
-    except ValueError as e:
-        raise UsageError(f"--rotate {wish[:60]}: give x,y,z,degrees, or level") from e
     return edit.rotation_about(np.array([x, y, z]), math.radians(degrees))
 
 
