@@ -1,7 +1,5 @@
 """Folders: results, temporary folders and caches, where no link leads elsewhere."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import errno
@@ -51,7 +49,7 @@ class RefusedError(OSError):
 class Folder(contextlib.AbstractContextManager["Folder"]):
     """An open folder, whose entries are used by name without following links; a context manager that closes it."""
 
-    def __init__(self, path: Path, above: Folder | None = None):
+    def __init__(self, path: Path, above: "Folder | None" = None):
         """Open a folder by its path, or in the folder ``above`` it, where it may be no link."""
         self.path = path
         self.descriptor: int | None = None
@@ -112,7 +110,7 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
             raise refused
         return descriptor
 
-    def folder(self, name: str, make: bool = False) -> Folder:
+    def folder(self, name: str, make: bool = False) -> "Folder":
         """Open a folder in this one, and make it first if it is missing and ``make`` is True."""
         if name == os.pardir:
             raise RefusedError(f"{self.path / name}: use a path without {os.pardir} inside the folder")
@@ -179,7 +177,7 @@ def is_below(path: Path) -> bool:
     return bool(_roots(path.absolute().parent))
 
 
-def open_folder(path: Path, make: bool = False) -> Folder:
+def open_folder(path: Path, make: bool = False) -> "Folder":
     """Open a folder, to use its entries; links on the way are followed, except below an open `output_folder`."""
     path = path.absolute()
     if not (roots := _roots(path)):

@@ -1,7 +1,5 @@
 """Images of a scene: decoded, turned as the camera was, resized, masked."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable
@@ -148,7 +146,7 @@ class Lens:
     fisheye: bool = False
     """True for OpenCV's fisheye model."""
 
-    def checked(self, where: str) -> Lens:
+    def checked(self, where: str) -> "Lens":
         """Return this lens after a check of its numbers; ``where`` names file and image in errors.
 
         Raises:

@@ -1,7 +1,5 @@
 """What networks say of each view: depth and saliency."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

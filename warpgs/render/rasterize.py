@@ -1,7 +1,5 @@
 """The rasterizer: `rasterize` checks what it is given, renders it, and `select_rule` measures its rules."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
@@ -233,7 +231,7 @@ def _checked_channels(name: str, values: Tensor | None, inputs: ProjectInputs) -
     return values if values.ndim == 3 else values[None]
 
 
-def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: Tensor) -> None:
+def _check_memory(window: Window, layers: "list[Layer]", heaviest: int, like: Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
     # and alpha, depth, transmittance, sum of weights
     channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers) + 2 * heaviest

@@ -1,7 +1,5 @@
 """Requests for a fit, with their scene and device."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -38,7 +36,7 @@ class SceneRequest(SceneOptions):
     matcher: str | None = None
     """ONNX file of `warpgs priors export --model xfeat`, used if SIFT leaves photographs without a pose; None: SIFT only."""
 
-    def with_scale(self, device: str) -> SceneRequest:
+    def with_scale(self, device: str) -> "SceneRequest":
         """Return this request with default image sizes resolved for ``device``, cpu or cuda, to store it with a run."""
         side = CPU_MAX_SIDE if device == "cpu" and self.max_side is None and self.downscale is None else self.max_side
         downscale, max_side = image_scale(self.downscale, side)

@@ -1,7 +1,5 @@
 """What a step number decides: rates, events, backgrounds; and the report of a step."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence
@@ -139,7 +137,7 @@ class Phases:
         begun = (self.stable_start - 1) / planned
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
-    def stable_from(self, step: int, planned_start: int) -> Phases:
+    def stable_from(self, step: int, planned_start: int) -> "Phases":
         """Return the phases for a third phase that begins after ``step``, not as planned, and is shortened in proportion."""
         length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
