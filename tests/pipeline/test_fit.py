@@ -402,8 +402,11 @@ def test_a_sheet_per_training_view(scene, tmp_path, capsys):
     assert "d.onnx (SHA-256 " in text and "assumed multiple 32, mean 0.5 0.5 0.5" in text
     sheet = cv2.imread(str(sheets[0]))
     assert sheet.shape[1] > 1500 and sheet.std() > 20
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").iterdir()}
     assert main(show(scene, "--out", tmp_path / "b", *flags)) == 0
-    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps read from the cache" in capsys.readouterr().out
+    assert len(written) == 2 * len(sheets) and written == {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "cache").iterdir()
+    }
     for path in sheets:
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b" / path.name)), cv2.imread(str(path)))
 

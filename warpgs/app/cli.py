@@ -214,7 +214,3 @@ def _run(arguments: list[str]) -> int:
         if is_out_of_memory(e):
             return last_words(f"warpgs: {no_memory_message(e)}", ResourceError.exit_code)
         return report_defect(e, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -205,17 +205,14 @@ class MapCache:
     """A folder of maps; ``notes`` report damaged entries, which are computed again, and a folder that cannot be written."""
 
     def __init__(self, folder: Path):
-        self.folder, self.notes, self.found, self.made = folder, list[str](), 0, 0
+        self.folder, self.notes = folder, list[str]()
 
     def maps(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], Arrays]) -> Arrays:
         """Return one map per name, float32 [H, W], of an image [H, W, 3], read from disk or computed by ``make``."""
         path = self._path(image, names, decided_by)
-        if (maps := self._read(path, names, image.shape[:2])) is not None:
-            self.found += 1
-            return maps
-        maps = make()
-        self.made += 1
-        self._write(path, names, maps)
+        if (maps := self._read(path, names, image.shape[:2])) is None:
+            maps = make()
+            self._write(path, names, maps)
         return maps
 
     def _path(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict) -> Path:

@@ -219,7 +219,7 @@ def latex(table: Table) -> str:
     return "\n".join([*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table}"]) + "\n"
 
 
-INK, SOFT, RULE, BAND = "#1b1d21", "#666c76", "#d9dce1", "#f6f6f3"
+INK, SOFT, RULE = "#1b1d21", "#666c76", "#d9dce1"
 BETTER, WORSE, UNDECIDED = "#0b6e6e", "#c2570c", "#7a808a"
 """Colours of an interval on the better side of 0, on the worse side, and across 0: distinct for any colour vision."""
 ROW, PANEL, VALUES, GAP, MARGIN = 38, 230, 184, 24, 24
@@ -272,10 +272,7 @@ def forest(table: Table) -> str:
         _text(MARGIN, 34, table.caption, 17, weight=600),
     ]
     for i, name in enumerate(names):
-        y = TOP + ROW * i
-        if i % 2 == 0:
-            out.append(f'<rect x="{MARGIN - 8}" y="{y}" width="{width - 2 * MARGIN + 16:.0f}" height="{ROW}" fill="{BAND}"/>')
-        out.append(_text(MARGIN, y + ROW / 2 + 4, name, 13, weight=600 if name == base else 400))
+        out.append(_text(MARGIN, TOP + ROW * (i + 0.5) + 4, name, 13, weight=600 if name == base else 400))
     for k, (metric, differences) in enumerate(panels.items()):
         label, upwards, digits = METRICS[metric]
         values = [abs(v) for d in differences for v in (*d.values, d.low, d.high) if math.isfinite(v)]
