@@ -21,7 +21,7 @@ from warpgs import schema
 from warpgs.errors import DataError, ResourceError, WarpgsError, expect, explained, install_extras
 from warpgs.process import Say, say
 from warpgs.ranks import HOST, Allowance, WebGuard, loopback_socket
-from warpgs.schema import Schema, SchemaError
+from warpgs.schema import Schema
 
 if TYPE_CHECKING:
     import viser
@@ -119,15 +119,13 @@ MAX_TEXT = 4096
 
 def _short(value: Any, place: str) -> None:
     schema.text(value, place)
-    if len(value) > MAX_TEXT:
-        raise SchemaError(f"{place} must be at most {MAX_TEXT} letters long")
+    expect(len(value) <= MAX_TEXT, f"{place} must be at most {MAX_TEXT} letters long")
 
 
 def _rotation(value: Any, place: str) -> None:
     """Allow unit quaternions."""
     schema.items(schema.number(-1.01, high=1.01), 4)(value, place)
-    if abs(math.hypot(*value) - 1) > 0.01:
-        raise SchemaError(f"{place} must be a unit quaternion")
+    expect(abs(math.hypot(*value) - 1) <= 0.01, f"{place} must be a unit quaternion")
 
 
 def _value(value: Any, place: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, get_type_hints
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError, explained
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.files import input_digest, read_file, write_json
 from warpgs.io.folder import READERS, all_readers
 from warpgs.pipeline.run.folder import CONFIG
@@ -168,16 +168,15 @@ _LINE = schema.fields({"scene": schema.text}, {"name": schema.text})
 def _flag(key: str, value: Any) -> str:
     """Return a setting of a line as an argument of a command line."""
     name = key.replace("_", "-")
-    if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
-        raise schema.SchemaError(f"{key[:40]!r} cannot be set for a single job")
+    own = re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) and name not in FARM_FLAGS
+    expect(own, f"{key[:40]!r} cannot be set for a single job")
     if isinstance(value, bool):
         group, dot, last = name.rpartition(".")
         return f"--{name}" if value else f"--{group}{dot}no-{last}"
-    if not isinstance(value, (str, int, float)):
-        raise schema.SchemaError(f"{key[:40]} must be text, a number, true or false")
+    expect(isinstance(value, (str, int, float)), f"{key[:40]} must be text, a number, true or false")
     schema.text(str(value), key[:40])
-    if name in PLUGINS and ":" in str(value):
-        raise schema.SchemaError(f"{key} names user code; give it as --{name} on the command line of the farm")
+    code = name in PLUGINS and ":" in str(value)
+    expect(not code, f"{key} names user code; give it as --{name} on the command line of the farm")
     return f"--{name}={value}"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from warpgs.errors import DataError, UsageError, explained
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.files import open_input, read_tensors, remove_leftovers, tensor_pieces, write_bytes
 
 FORMAT = "warpgs-lpips-1"
@@ -109,8 +109,7 @@ def _check_unpacked(file: BinaryIO) -> None:
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > file.seek(0, os.SEEK_END):
-            raise ValueError(f"it unpacks to {unpacked:,} bytes, more than its size")
+        expect(unpacked <= file.seek(0, os.SEEK_END), f"it unpacks to {unpacked:,} bytes, more than its size")
     file.seek(0)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError, explained
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.files import read_tensors, tensor_pieces, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
@@ -42,16 +42,15 @@ def truncated(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
 
 def pack(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     """Pack coefficients [N, K, 3] up to each Gaussian's degree [N], which ascend, into one vector [M]."""
-    if bool((degrees.diff() < 0).any()):
-        raise ValueError("degrees must ascend; sort the Gaussians by degree first")
+    expect((degrees.diff() >= 0).all(), "degrees must ascend; sort the Gaussians by degree first")
     return torch.cat([sh[degrees == d, : (d + 1) ** 2].reshape(-1) for d in range(MAX_DEGREE + 1)])
 
 
 def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     """Return coefficients [N, K, 3] from the vector [M] of `pack`: K for the highest degree, 0 above each Gaussian's degree."""
     whole = degrees.ndim == 1 and not degrees.is_floating_point() and bool(((degrees >= 0) & (degrees <= MAX_DEGREE)).all())
-    if packed.shape != (3 * int((degrees.long() + 1).square().sum()) if whole else -1,):
-        raise ValueError(f"coefficients {list(packed.shape)} do not fit degrees {list(degrees.shape)}, 0 to {MAX_DEGREE}")
+    fits = whole and packed.shape == (3 * int((degrees.long() + 1).square().sum()),)
+    expect(fits, f"coefficients {list(packed.shape)} do not fit degrees {list(degrees.shape)}, 0 to {MAX_DEGREE}")
     highest = int(degrees.max()) if len(degrees) else 0
     sh, at = packed.new_zeros(len(degrees), (highest + 1) ** 2, 3), 0
     for d in range(highest + 1):

@@ -44,8 +44,8 @@ def _view_name(value: Any, place: str) -> None:
     """Allow names of views: relative paths of files."""
     text(value, place)
     path = PurePosixPath(value)
-    if path.is_absolute() or path.name in ("", "..") or ".." in path.parts:
-        raise SchemaError(f"{place} must be the relative path of an image, not {value[:60]!r}")
+    sound = not path.is_absolute() and path.name not in ("", "..") and ".." not in path.parts
+    expect(sound, f"{place} must be the relative path of an image, not {value[:60]!r}")
 
 
 _MATRICES = {name: items(items(number(), size), size) for name, size in (("viewmat", 4), ("K", 3))}
@@ -236,16 +236,13 @@ def record_of(
 def read_record(folder: Path) -> dict[str, Any]:
     """Read config.json of a run folder; its format is checked first."""
     path = folder / CONFIG
-    try:
-        record = schema.read(path, folder)
-    except (FileNotFoundError, NotADirectoryError) as e:
+    fix = "give a folder that `warpgs fit --out` filled"
+    if not os.path.lexists(path):
         lack = f"not the folder of a run ({CONFIG} is missing)" if folder.exists() else "no such folder"
-        near = similar_folder(folder) if not folder.exists() else ""
-        raise DataError(f"{folder}: {lack}; {near or 'give a folder that `warpgs fit --out` filled'}") from e
-    except (OSError, SchemaError) as e:
-        raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
-    if not isinstance(record, dict) or "config" not in record:
-        raise DataError(f"{path}: not a record of a fit; give a folder that `warpgs fit --out` wrote")
+        raise DataError(f"{folder}: {lack}; {(not folder.exists() and similar_folder(folder)) or fix}")
+    with explained(f"{path}: not a record of a fit", fix, (OSError, ValueError)):
+        record = schema.read(path, folder)
+        expect(isinstance(record, dict) and "config" in record, "it has no settings")
     if record.get("format") != FORMAT:  # version 0.1.0 stored no number
         stored = record.get("versions")
         version = stored.get("warpgs", "unknown") if isinstance(stored, dict) else "unknown"
