@@ -471,8 +471,6 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
     return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {listed(out)}"] if out else []
 
 
-MAX_FOCAL = 100
-"""Largest usual focal length as a multiple of the longer side: a field of view of 0.6 degrees."""
 MIN_BASELINE = 1e-3
 """Spread of the cameras, as a fraction of their distance from the points, below which parallax is less than a pixel."""
 
@@ -498,12 +496,6 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
             distance = float(np.median(np.linalg.norm(points.points - middle, axis=1)))
     if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
         notes.append(f"all cameras are within {spread:.2g} units of one place, without depth: move between photographs")
-    off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
-    if off:
-        notes.append(f"principal points of {len(off)} views, as of {off[0].name}, are outside the image; calibrate again")
-    narrow = [v for v in views if not v.camera.K[0, 0] <= MAX_FOCAL * max(v.camera.width, v.camera.height)]
-    if narrow:
-        notes.append(f"focal lengths of {len(narrow)} views, as of {narrow[0].name}, are over {MAX_FOCAL} sides; check them")
     # most photographs differ, and vary, in a few pixels already
     equal: dict[bytes, list[str]] = {}
     few = [v.image[::SPARSE, ::SPARSE] for v in views]

@@ -16,9 +16,9 @@ MAX_WEBP_SIDE = 16383
 
 
 def png(image: np.ndarray) -> bytes:
-    """Encode colours in [0, 1], [H, W, 3] or with straight alpha [H, W, 4], as 8-bit PNG; values outside are clamped."""
+    """Encode values in [0, 1], grey [H, W], RGB or RGBA [H, W, C], as PNG of 8 bits a channel; values outside are clamped."""
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    return _encoded(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
+    return _encoded(".png", pixels if pixels.ndim == 2 else pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
 
 
 def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> bytes:

@@ -170,7 +170,7 @@ def render(
     tell = Stages()
     settings = replace(settings, background=color)
     plan = film.plan_film(stored, path, settings)
-    training: list[View] | bool = False
+    training: list[View] | bool = coverage
     alone, one_size = film.check_plan(plan, out, coverage, sheet)
     told = not alone and any(p.is_file() for p in (out / film.FILM, *home.glob(f"path-*/{film.FILM}")))
     if one_size and not told and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
@@ -179,7 +179,6 @@ def render(
         try:
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
         except WarpgsError as e:
-            training = True
             notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / film.COVERAGE}: {COVERAGE_LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
@@ -333,8 +332,6 @@ def clean(
             write_bytes(out, png(clean_picture(stored, found, train)))
         home = shlex.quote(str(folder))
         last.append(f"picture in {out}; `warpgs prune {home} --clean all`, or with some of these names, removes them")
-        box = f"save a crop box in `warpgs view {home}`, then `warpgs export {home} --to FILE --crop {home}/crop.json`"
-        last.append(f"if smears remain, cut them off: {box}")
     else:
         last = write_clean(stored, out, found, scores)
     return [

@@ -138,8 +138,6 @@ def turned_line(rotation: np.ndarray) -> str:
 
 MAX_POINTS = 100_000
 """Largest number of points that COLMAP's files get: as many as a reconstruction of some hundred photographs."""
-ROUNDING = 1e-4
-"""Smallest change of a log scale that is reported: a hundredth of a percent."""
 
 
 def convert(
@@ -208,14 +206,6 @@ def _written(
     kind.origin = origin
     with hold_file(target) as notes:
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
-    if type(kind).decode is not Format.decode:  # the rounding errors, measured on the file
-        back = kind.read_stored(target)
-        moved = float((back.means.double() - gaussians.means.double()).abs().max())
-        scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
-        other = int((scales > 0.1).sum())
-        if moved or not float(scales.max()) < ROUNDING:
-            more = f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else ""
-            lines.append(f"the format rounds positions, by at most {moved:.2g} {_unit(stored)}{more}")
     lines += ([kind.note] if kind.note else []) + origin_line(origin)
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(kind.size(target))}"]
 

@@ -293,10 +293,8 @@ def forest(table: Table) -> str:
             out += _line(table, name, metric, TOP + ROW * (i + 0.5) - 3, x0, px)
     if not panels:
         out.append(_text(MARGIN, 66, "no pair of runs to compare", 13, color=SOFT))
-    words = f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds"
-    out.append(_text(MARGIN, height - 18, words, 11, color=SOFT))
-    x = MARGIN + 6.0 * len(words) + 8
-    for color, meaning in ((BETTER, "better"), (WORSE, "worse"), (UNDECIDED, "undecided: the interval contains 0")):
-        out += [_dot(x, height - 22, 4.5, color), _text(x + 9, height - 18, meaning, 11, color=SOFT)]
-        x += 6.0 * len(meaning) + 28
+    words = (
+        f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds; teal: better, orange: "
+    )
+    out.append(_text(MARGIN, height - 18, f"{words}worse, gray: undecided, the interval contains 0", 11, color=SOFT))
     return "\n".join([*out, "</svg>"]) + "\n"
