@@ -39,7 +39,7 @@ from warpgs.scene import C0, Camera, Gaussians
 )
 def test_a_rule_checks_its_cut_offs(field, values):
     for value in values:
-        with pytest.raises(UsageError, match=rf"Rule\.{field} must be .*{value}"):
+        with pytest.raises(UsageError, match=rf"Rule .*{field} must be .*{value}"):
             Rule("own", **{field: value})
     assert Rule("own", alpha_cut=0, transmittance_stop=0.0, low_pass=np.float32(0)).low_pass == 0
 

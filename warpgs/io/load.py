@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, did_you_mean, explained, listed, similar_folder
+from warpgs.errors import DataError, UsageError, did_you_mean, expect, explained, listed, similar_folder
 from warpgs.geometry import camera_extent, matmul, near_cameras
 from warpgs.io import folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder
@@ -296,18 +296,18 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     inner = folder / "mask"
     folder = inner if inner.is_dir() else folder
     files = list_images(folder) if folder.is_dir() else []
-    if not files:
-        raise DataError(f"{folder}: contains no masks; name the folder that contains 000.png, 001.png, ... with --score-masks")
-    numbers, ids = scenes.image_ids([f.name for f in files]), scenes.image_ids([v.name for v in views])
-    if numbers is None:
-        raise DataError(f"{folder}: the masks have no distinct numbers; name them 000.png, 001.png, ... by id")
+    names = [v.name for v in views]
+    numbers, ids = scenes.image_ids([f.name for f in files]) or [], scenes.image_ids(names) or []
     masks = dict(zip(numbers, files))
-    if ids is None:
-        raise DataError(f"{folder}: masks have image ids, the images ({views[0].name}, ...) no distinct ones; name them by id")
-    if missing := sorted(set(ids) - set(masks)):
-        raise DataError(f"{folder}: no mask for image id {listed(missing, 8)} (an image rect_001_... is id 0); restore it")
-    if min(ids) == 1 and 0 in masks and not scenes.named_by_dtu([v.name for v in views]):
-        raise DataError(f"{folder}: the images start with 1, the masks with 0; let both count from 0, or remove mask 0")
+    fix = "give a folder with 000.png, 001.png, ... by image id to --score-masks (an image rect_001_... is id 0)"
+    with explained(f"{folder}: these masks do not fit", fix, ValueError):
+        expect(files, "the folder contains none")
+        expect(numbers, "the masks have no distinct numbers")
+        expect(ids, f"the images ({names[0]}, ...) have no distinct numbers")
+        missing = sorted(set(ids) - set(masks))
+        expect(not missing, f"no mask for image id {listed(missing, 8)}")
+        shifted = min(ids) == 1 and 0 in masks and not scenes.named_by_dtu(names)
+        expect(not shifted, "the images start with 1, the masks with 0: let both count from 0, or remove mask 0")
     done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]) > 0.5, v)) for i, v in zip(ids, views)]
     return done, f"scores use only pixels inside the masks in {folder}, matched by image id; the fit ignores these masks"
 

@@ -156,14 +156,13 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     """Read a converted file: the network, its tensors by name (float32, CPU), and the header with the file's SHA-256."""
     fix = "write the file again with `warpgs convert-lpips`"
     tensors, metadata, data = read_tensors(path, "`warpgs convert-lpips` writes one", fix)
-    if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
-        raise DataError(f"{path}: holds no LPIPS weights; {fix}")
-    net = NETS[metadata["net"]]
-    for name, shape in net.shapes().items():
-        if name not in tensors or tuple(tensors[name].shape) != shape:
-            raise DataError(f"{path}: no {name} of shape {list(shape)}; {fix}")
-        if tensors[name].dtype != torch.float32 or not bool(torch.isfinite(tensors[name]).all()):
-            raise DataError(f"{path}: {name} is not finite float32; {fix}")
+    with explained(f"{path}: holds no LPIPS weights", fix, ValueError):
+        expect(metadata.get("format") == FORMAT and metadata.get("net") in NETS, "it names no format and network")
+        net = NETS[metadata["net"]]
+        for name, shape in net.shapes().items():
+            expect(name in tensors and tuple(tensors[name].shape) == shape, f"no {name} of shape {list(shape)}")
+            finite = tensors[name].dtype == torch.float32 and torch.isfinite(tensors[name]).all()
+            expect(finite, f"{name} is not finite float32")
     return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}
 
 

@@ -234,20 +234,18 @@ class Table:
 
     def _check(self, update: DensityUpdate, capacity: int | None) -> None:
         """Check the indices and values of a change, and the size of the set after it."""
-        for name, rows in {"keep": update.keep, "overwritten": update.overwritten, "parents": update.parents}.items():
-            if rows is None:
-                continue
-            if not isinstance(rows, torch.Tensor) or rows.dtype != torch.int64 or rows.ndim != 1:
-                raise UsageError(f"DensityUpdate.{name} must be an int64 tensor of one axis; give indices of rows")
-            low = -1 if name == "parents" else 0
-            if len(rows) and not low <= int(rows.min()) <= int(rows.max()) < self.count:
-                raise UsageError(f"DensityUpdate.{name} must be from {low} to {self.count - 1}, the rows before the change")
-            if name != "parents" and len(rows.unique()) < len(rows):
-                raise UsageError(f"DensityUpdate.{name} holds a row twice; give each row once, and copies through added")
-        for where, rows_of in (("added", update.added), ("values", update.values)):
-            for name, t in rows_of.items():
-                if bad := t.numel() - int(torch.isfinite(t).sum()):
-                    raise UsageError(f"DensityUpdate.{where}[{name!r}] has {bad:,} non-finite values; give finite ones")
+        rows_of = {"keep": (update.keep, 0), "overwritten": (update.overwritten, 0), "parents": (update.parents, -1)}
+        with explained("a DensityUpdate is impossible", "correct the strategy that gave it", ValueError, UsageError):
+            for name, (rows, low) in rows_of.items():
+                if rows is None:
+                    continue
+                indices = isinstance(rows, torch.Tensor) and rows.dtype == torch.int64 and rows.ndim == 1
+                expect(indices, f"{name} must be an int64 tensor of one axis, indices of rows")
+                there = not len(rows) or low <= int(rows.min()) <= int(rows.max()) < self.count
+                expect(there, f"{name} must be from {low} to {self.count - 1}, the rows before the change")
+                expect(low or len(rows.unique()) == len(rows), f"{name} holds a row twice; copies go through added")
+            for name, t in [*update.added.items(), *update.values.items()]:
+                expect(torch.isfinite(t).all(), f"the rows of {name} have non-finite values")
         after = len(update.keep) + len(update.parents)
         if capacity is not None and after > max(capacity, self.count):
             raise UsageError(
