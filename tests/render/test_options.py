@@ -131,7 +131,7 @@ def test_wrong_arguments(error):
         select_rule(g, views, max_error=0.1, measure="median")
     with pytest.raises(UsageError, match="at least one camera"):
         select_rule(g, [], max_error=0.1)
-    with pytest.raises(UsageError, match=r"list of cameras, not one: give \[camera\]"):
+    with pytest.raises(UsageError, match=r"list of at least one camera: \[camera\]"):
         select_rule(g, views[0], max_error=0.1)
 
 

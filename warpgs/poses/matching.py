@@ -143,8 +143,8 @@ class Matcher(Model):
             sound = all(a.dtype.kind == "f" and np.isfinite(a).all() for a in (keypoints, scores, descriptors))
             expect(sound, "they contain NaN or infinity, or are not floating-point")
             there, inside = scores > 0, (keypoints >= 0) & (keypoints <= [w, h])
-            sound = inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()
-            expect(sound, "keypoints must be in the image, descriptors of length 1")
+            placed = inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()
+            expect(placed, "keypoints must be in the image, descriptors of length 1")
 
 
 def mutual_matches(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -224,16 +224,15 @@ class MapCache:
 
         try:
             stored = load(read_input(path))
+            maps = tuple(stored[n] for n in names)
+            sound = (m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps)
+            expect(all(sound), "it is damaged")
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:
             self.notes.append(f"{path}: a stored map could not be read ({e}) and was computed again")
             return None
-        maps = tuple(stored.get(n) for n in names)
-        if all(m is not None and m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps):
-            return maps
-        self.notes.append(f"{path}: a stored map was damaged and was computed again")
-        return None
+        return maps
 
     def _write(self, path: Path, names: tuple[str, ...], maps: Arrays) -> None:
         from safetensors.numpy import save

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from warpgs.device import background
-from warpgs.errors import UsageError, did_you_mean, listed
+from warpgs.errors import UsageError, did_you_mean, expect, explained, listed
 from warpgs.files import make_folder, write_bytes
 from warpgs.geometry import convert_camera
 from warpgs.locks import hold_file, hold_folder
@@ -108,16 +108,13 @@ class FilmSettings:
 
     def __post_init__(self) -> None:
         """Check what can be checked before any work."""
-        low, high = paths.LIMITS["width"]
-        if self.size is not None and not all(low <= s <= high for s in self.size):
-            raise UsageError(f"each side of a film must have {low} to {high} px, not {self.size[0]} x {self.size[1]}")
-        low, high = paths.LIMITS["fov"]
-        if self.fov_y is not None and not math.radians(low) <= self.fov_y <= math.radians(high):
-            raise UsageError(f"--fov must be {low:g} to {high:g} degrees, not {math.degrees(self.fov_y):g}")
-        if self.seconds is not None and not 0 < self.seconds * self.fps <= MAX_FRAMES:
-            raise UsageError(f"a film must be longer than 0 s and have at most {MAX_FRAMES:,} frames, not {self.seconds:g} s")
-        if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
-            raise UsageError(f"a film must have 1 to {MAX_FRAMES:,} frames, not {self.frames}")
+        (least, most), (low, high) = paths.LIMITS["width"], paths.LIMITS["fov"]
+        with explained("a film cannot be so", "give another value", ValueError, UsageError):
+            expect(all(least <= s <= most for s in self.size or ()), f"sides must have {least} to {most} px, not {self.size}")
+            fits = self.fov_y is None or math.radians(low) <= self.fov_y <= math.radians(high)
+            expect(fits, f"--fov must be {low:g} to {high:g} degrees")
+            counts = self.frames, self.seconds and self.seconds * self.fps
+            expect(all(n is None or 0 < n <= MAX_FRAMES for n in counts), f"it must have 1 to {MAX_FRAMES:,} frames")
 
     def count(self, seconds: float) -> int:
         """Return the number of frames of a film; ``seconds`` is its duration if the settings have none."""
@@ -226,16 +223,12 @@ COVERAGE = "coverage"
 
 def check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
-    if not plan.cameras:
-        raise UsageError("no camera to render; give at least one")
-    alone = out.suffix.lower() in SUFFIXES
-    if not alone and out.suffix and not out.is_dir():
-        raise UsageError(f"{out}: unknown film suffix; use {', '.join(SUFFIXES)}, or a folder without a suffix for images")
-    one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
-    if (alone or sheet) and not one_size:
-        raise UsageError(f"{out}: views differ in size, but a film or sheet needs one; give --size, or a folder, no --sheet")
-    if alone and coverage:
-        raise UsageError(f"{out}: coverage images are PNG files; give a folder instead of a film")
+    alone, one_size = out.suffix.lower() in SUFFIXES, len({(c.width, c.height) for _, c in plan.cameras}) == 1
+    with explained(f"{out}: cannot be rendered so", "give a folder, or leave out what it excludes", ValueError, UsageError):
+        expect(plan.cameras, "there is no camera")
+        expect(alone or not out.suffix or out.is_dir(), f"films end in {', '.join(SUFFIXES)}")
+        expect(one_size or not (alone or sheet), "views differ in size, but a film or sheet needs one: give --size")
+        expect(not (alone and coverage), "coverage images are PNG files in a folder")
     return alone, one_size
 
 

@@ -14,7 +14,7 @@ import torch
 
 from warpgs.constants import LOW_PASS, rule_named
 from warpgs.device import format_bytes
-from warpgs.errors import DataError, UsageError, WarpgsError
+from warpgs.errors import DataError, UsageError, WarpgsError, expect, explained
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.export.ply import write_ply
 from warpgs.files import filling, write_bytes, write_json, writing_into
@@ -377,14 +377,11 @@ def plot(
     background: str = "white", size: tuple[int, int] = (1600, 1000), cameras: bool = True,
 ) -> list[str]:  # fmt: skip
     """Write a plot of a run as PNG, with the options of `warpgs plot`; returns lines for the user."""
-    if not all(SIZES[0] <= s <= SIZES[1] for s in size):
-        raise UsageError(f"--size {size[0]} {size[1]}: each side must have {SIZES[0]} to {SIZES[1]} px")
-    start, by_coverage = points == "start", color == "coverage"
-    if start and by_coverage:
-        raise UsageError("--color coverage needs Gaussians; leave out --points start")
-    out = folder / PLOT if out is None else out
-    if out.suffix.lower() != ".png":
-        raise UsageError(f"{out}: a plot is a .png file; give a name that ends in .png")
+    start, by_coverage, out = points == "start", color == "coverage", folder / PLOT if out is None else out
+    with explained(f"{out}: no such plot", "change this", ValueError, UsageError):
+        expect(all(SIZES[0] <= s <= SIZES[1] for s in size), f"each side of --size must have {SIZES[0]} to {SIZES[1]} px")
+        expect(not (start and by_coverage), "--color coverage needs Gaussians, not --points start")
+        expect(out.suffix.lower() == ".png", "a plot is a .png file")
     stored, tell = open_run(folder, device_name), waiting()
     found, gaussians = stored.cameras(), stored.gaussians()
     train, test = ([found[n] for n in names] for names in (stored.train, stored.test))

@@ -84,11 +84,6 @@ def file_gaussians(stored: StoredRun) -> Gaussians:
     return convert_gaussians(edit.drop_unused_sh(stored.gaussians()), stored.normalization.local, "scene", "file")
 
 
-def _unit(stored: StoredRun | None) -> str:
-    """Return the name of the unit of a run's files, or of a file of no run."""
-    return "m" if stored is not None and stored.normalization.unit == "m" else "units of the scene's files"
-
-
 def origin_line(origin: np.ndarray) -> list[str]:
     """Return a line for the user on the origin [3] of a file, if it is not 0."""
     at = ", ".join(f"{v:.12g}" for v in origin)
@@ -261,7 +256,7 @@ def mesh(
         options = replace(options, crop=box)
 
     def planned(plan: GridPlan, memory: str) -> None:
-        size = f"{' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {_unit(run)}"
+        size = f"{' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {run.normalization.unit}"
         lost = f"; {1 - plan.inside:.1%} of the observed surface is outside the grid and left out"
         say(f"grid: {size}{lost * (plan.inside < 0.9995)}")
 
@@ -279,7 +274,5 @@ def mesh(
     ]
     if found.uncolored:
         lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")
-    if up is None and target.suffix.lower() == ".glb":
-        notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
     lines += origin_line(run.normalization.origin)
     return [*run.notes(), *notes, *lines, f"{target}: {format_bytes(target.stat().st_size)}"]

@@ -241,7 +241,7 @@ def read_record(folder: Path) -> dict[str, Any]:
         lack = f"not the folder of a run ({CONFIG} is missing)" if folder.exists() else "no such folder"
         raise DataError(f"{folder}: {lack}; {(not folder.exists() and similar_folder(folder)) or fix}")
     with explained(f"{path}: not a record of a fit", fix, (OSError, ValueError)):
-        record = schema.read(path, folder)
+        record: dict[str, Any] = schema.read(path, folder)
         expect(isinstance(record, dict) and "config" in record, "it has no settings")
     if record.get("format") != FORMAT:  # version 0.1.0 stored no number
         stored = record.get("versions")

@@ -94,8 +94,6 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     """Split a scene by ``spec`` (None: all views train); returns the split and notes on doubtful scores."""
     split = split_views(scene, "all" if spec is None else spec)
     notes = [] if split.test else [NO_SCORES]
-    if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
-        notes.append("masks hide pixels from the fit, unlike in the published DTU protocol; score with --score-masks instead")
     for test, train in coincident_views(scene, split):
         notes.append(f"{test} is held out, but training view {train} has the same pose, so this score does not test new views")
     return split, notes

@@ -214,7 +214,8 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
             color, why = scene.background, "that of the scene's files, since views show a cut-out object"
         else:
             return scene.background, ""
-    return color, f"background: {why}, {_words(color)}; change it with --background"
+    code = "".join(f"{round(255 * c):02x}" for c in color)
+    return color, f"background: {why}, #{code}; change it with --background"
 
 
 def over_background(scene: Scene, color: Color) -> Scene:
@@ -238,11 +239,6 @@ def random_shift(seed: int, step: int, background: Sequence[float]) -> tuple[flo
     """Return a random colour, uniform in [0, 1], minus the scene's background [3]; it depends on seed and step only."""
     red, green, blue = (b - a for a, b in zip(background, np.random.default_rng([seed, step, BEHIND]).random(3).tolist()))
     return red, green, blue
-
-
-def _words(color: Color) -> str:
-    """Return a colour as text, #rrggbb."""
-    return "#" + "".join(f"{round(255 * c):02x}" for c in color)
 
 
 @dataclass(frozen=True)
