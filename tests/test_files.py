@@ -31,7 +31,6 @@ from warpgs.files import (
     remove_file,
     remove_leftovers,
     replacing,
-    unread_reason,
     write_bytes,
 )
 from warpgs.folders import NAMES as OWN_NAMES
@@ -278,7 +277,7 @@ def test_what_is_no_regular_file_is_refused(kind, words, tmp_path, monkeypatch):
     for read in (open_input, read_input, lambda p: read_start(p, 4)):
         with pytest.raises(OSError) as e:
             read(path)
-        assert words in unread_reason(e.value) and str(tmp_path) in str(e.value)
+        assert words in e.value.strerror and str(tmp_path) in str(e.value)
     with pytest.raises(DataError, match=f"cannot be read .*{words}.*; mend it"):
         read_file(path, fix="mend it")
     with pytest.raises(DataError, match=f"cannot be read .*{words}"):

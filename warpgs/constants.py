@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from numbers import Real
 
-from warpgs.errors import UsageError, document_fields
+from warpgs.errors import UsageError, document_fields, expect, explained
 
 ALPHA_CUT = 1.0 / 255.0
 """Smallest alpha that is blended: one step of an 8-bit channel (renderer of Kerbl et al. 2023)."""
@@ -113,19 +113,15 @@ class Rule:
         Raises:
             UsageError: A cut-off is not a number, or is outside its range.
         """
-        for name in ("alpha_cut", "alpha_max", "transmittance_stop", "near", "far", "low_pass", "square_sigma"):
-            if not isinstance(getattr(self, name), Real):
-                raise UsageError(f"Rule.{name} must be a number, not {getattr(self, name)!r}")
-        for name in ("alpha_cut", "transmittance_stop"):
-            if not 0 <= getattr(self, name) < 1:
-                raise UsageError(f"Rule.{name} must be at least 0 and below 1, not {getattr(self, name)}")
-        if not 0 < self.alpha_max <= LARGEST_ALPHA:
-            raise UsageError(f"Rule.alpha_max must be in (0, 1) as float32, not {self.alpha_max}; give 0.999")
-        for name in ("low_pass", "square_sigma"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"Rule.{name} must be a finite number of at least 0, not {getattr(self, name)}")
-        if not isinstance(self.inclusive_stop, bool):
-            raise UsageError(f"Rule.inclusive_stop must be True or False, not {self.inclusive_stop!r}")
+        with explained("a Rule is impossible", "give another value", ValueError, UsageError):
+            for name in ("alpha_cut", "alpha_max", "transmittance_stop", "near", "far", "low_pass", "square_sigma"):
+                expect(isinstance(value := getattr(self, name), Real), f"{name} must be a number, not {value!r}")
+            for name in ("alpha_cut", "transmittance_stop"):
+                expect(0 <= (value := getattr(self, name)) < 1, f"{name} must be at least 0 and below 1, not {value}")
+            expect(0 < self.alpha_max <= LARGEST_ALPHA, f"alpha_max must be in (0, 1) as float32, not {self.alpha_max}")
+            for name in ("low_pass", "square_sigma"):
+                expect(0 <= (value := getattr(self, name)) < math.inf, f"{name} must be finite and at least 0, not {value}")
+            expect(isinstance(self.inclusive_stop, bool), f"inclusive_stop must be True or False, not {self.inclusive_stop!r}")
 
 
 RULES = {

@@ -178,11 +178,6 @@ def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def unread_reason(error: Exception) -> str:
-    """Return why a file could not be read, in words for the middle of a message."""
-    return getattr(error, "strerror", None) or str(error)
-
-
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 UNDECODABLE = re.compile("[\udc80-\udcff]")
@@ -193,8 +188,6 @@ FIXES = {errno.ENOENT: "create its folder", errno.EACCES: "change its permission
 """What to do about an error, other than to free disk space."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
 """Errors of file systems that cannot sync a folder."""
-DESCRIPTORS = Path("/proc/self/fd")
-"""Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
 
 @contextlib.contextmanager
@@ -225,8 +218,7 @@ def replacing(
         open_folder(path.parent) as folder,
         temporary_file(folder, suffix) as (name, file),
     ):
-        shown = DESCRIPTORS / str(folder.descriptor)  # a path that libraries can use, where the system has such paths
-        reachable = (shown if folder.descriptor is not None and shown.is_dir() else folder.path) / name
+        reachable = folder.reachable() / name
         yield file, reachable
         file.flush()
         os.fsync(file.fileno())

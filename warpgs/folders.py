@@ -1,7 +1,5 @@
 """Folders: results, temporary folders and caches, where no link leads elsewhere."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import errno
@@ -33,6 +31,8 @@ WINDOWS = sys.platform == "win32"
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 JUNCTION = 0xA0000003
 """Tag of Windows for a folder that leads elsewhere."""
+DESCRIPTORS = Path("/proc/self/fd")
+"""Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
 
 class RefusedError(OSError):
@@ -49,7 +49,7 @@ class RefusedError(OSError):
 class Folder(contextlib.AbstractContextManager["Folder"]):
     """An open folder, whose entries are used by name without following links; a context manager that closes it."""
 
-    def __init__(self, path: Path, above: Folder | None = None):
+    def __init__(self, path: Path, above: "Folder | None" = None):
         """Open a folder by its path, or in the folder ``above`` it, where it may be no link."""
         self.path = path
         self.descriptor: int | None = None
@@ -71,6 +71,11 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
         """Close the descriptor."""
         if self.descriptor is not None:
             os.close(self.descriptor)
+
+    def reachable(self) -> Path:
+        """Return a path of this folder in ASCII, for libraries of this process, where the system has such paths."""
+        shown = DESCRIPTORS / str(self.descriptor)
+        return shown if shown.is_dir() else self.path
 
     def _name(self, name: str) -> str:
         return name if self.descriptor is not None else str(self.path / name)
@@ -105,7 +110,7 @@ class Folder(contextlib.AbstractContextManager["Folder"]):
             raise refused
         return descriptor
 
-    def folder(self, name: str, make: bool = False) -> Folder:
+    def folder(self, name: str, make: bool = False) -> "Folder":
         """Open a folder in this one, and make it first if it is missing and ``make`` is True."""
         if name == os.pardir:
             raise RefusedError(f"{self.path / name}: use a path without {os.pardir} inside the folder")
@@ -172,7 +177,7 @@ def is_below(path: Path) -> bool:
     return bool(_roots(path.absolute().parent))
 
 
-def open_folder(path: Path, make: bool = False) -> Folder:
+def open_folder(path: Path, make: bool = False) -> "Folder":
     """Open a folder, to use its entries; links on the way are followed, except below an open `output_folder`."""
     path = path.absolute()
     if not (roots := _roots(path)):

@@ -224,6 +224,21 @@ def pinhole_of(camera: Camera) -> Camera:
     return replace(camera, model="pinhole", distortion=None) if camera.model != "pinhole" else camera
 
 
+def resized(camera: Camera, factor: float) -> Camera:
+    """Return the camera of the image at another size, at least one pixel on each side."""
+    if factor == 1:
+        return camera
+    width, height = (max(1, int(factor * n)) for n in (camera.width, camera.height))
+    scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, K=scale * camera.K, width=width, height=height)
+
+
+def inside(points: np.ndarray, box: Box) -> np.ndarray:
+    """Mask [N] of the points [N, 3] in a box in the same units."""
+    center, size, rotation = box
+    return (np.abs(matmul(points - center, rotation)) <= np.asarray(size) / 2).all(1)
+
+
 def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return a [..., J] times b [J] or [J, K], with the same bits on every x86-64 processor.
 

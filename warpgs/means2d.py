@@ -1,7 +1,5 @@
 """Projected means that hold their gradients after a backward pass, for density strategies."""
 
-from __future__ import annotations
-
 import copy
 import functools
 from collections.abc import Callable, Sequence
@@ -26,7 +24,7 @@ class ProjectedMeans(torch.Tensor):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         raise AttributeError("means2d has no absgrad yet: it needs RasterizeOptions(absgrad=True) and a backward pass")
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedMeans:
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ProjectedMeans":
         """Return a copy of the means and of their gradients so far; later backward passes do not change the copy."""
         copied = memo[id(self)] = self.detach().clone().as_subclass(ProjectedMeans)
         for name in ("grad", "absgrad"):

@@ -94,8 +94,8 @@ def check_onnx(data: bytes, path: Path) -> None:
     with explained(f"{path}: not an ONNX model", "export it again, as with `torch.onnx.export`", (ValueError, IndexError)):
         model = _message(memoryview(data))
         graphs = sum(n == MODEL_GRAPH and isinstance(v, memoryview) for n, v in model)
-        if graphs != 1 or not any(n == MODEL_OPSET for n, _ in model):
-            raise ValueError("it has several graphs, or names no operator set" if graphs else "it has no graph")
+        sound = graphs == 1 and any(n == MODEL_OPSET for n, _ in model)
+        expect(sound, "it has several graphs, or names no operator set" if graphs else "it has no graph")
         # exporters store compositions of standard operators as functions in the file
         functions = [_message(v) for n, v in model if n == MODEL_FUNCTION and isinstance(v, memoryview)]
         own: dict[tuple[str, str], list[Message]] = {}

@@ -86,11 +86,6 @@ class CarefulStream:
             except (OSError, ValueError) as e:
                 self._lose(e)
 
-    def writelines(self, lines: Any) -> None:
-        """Write several texts."""
-        for line in lines:
-            self.write(line)
-
     def _lose(self, error: OSError | ValueError) -> None:
         """Keep the first error, and point the descriptor at the null device: buffers are flushed once more when Python ends."""
         if isinstance(error, ValueError) and not isinstance(error, OSError) and not self.stream.closed:

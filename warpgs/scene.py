@@ -314,11 +314,6 @@ class ViewDepth:
     given: np.ndarray | None = None
     """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 for missing values; None if none was given."""
 
-    @property
-    def coverage(self) -> float:
-        """Fraction of the pixels that are valid, in [0, 1]."""
-        return float(self.valid.mean())
-
 
 class _GaussianSet(_Record):
     """What sets of Gaussians have in common, whatever their parameters."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from warpgs.errors import UsageError
+from warpgs.errors import MalformedError, UsageError, expect
 from warpgs.files import read_input
 
 MAX_BYTES = 2**25
@@ -30,14 +30,13 @@ MAX_NUMBER = 1e300
 Schema = Callable[[Any, str], None]
 
 
-class SchemaError(ValueError):
-    """Text that is not JSON, or a value that its schema does not allow; the message names the place."""
+SchemaError = MalformedError
+"""Error of text that is not JSON, or of a value that its schema does not allow; the message names the place."""
 
 
 def parse(text: str | bytes) -> Any:
     """Return the value of a JSON text."""
-    if len(text) > MAX_BYTES:
-        raise SchemaError(f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
+    expect(len(text) <= MAX_BYTES, f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
     check_parts(text)
     try:
         value = json.loads(text)
@@ -52,8 +51,7 @@ def parse(text: str | bytes) -> Any:
 def check_parts(text: str | bytes) -> None:
     """Check the number of lists and objects of a JSON text before it is parsed."""
     count = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
-    if count > MAX_PARTS:
-        raise SchemaError(f"has more than {MAX_PARTS:,} lists and objects")
+    expect(count <= MAX_PARTS, f"has more than {MAX_PARTS:,} lists and objects")
 
 
 def check_depth(value: Any, most: int) -> None:
@@ -61,8 +59,7 @@ def check_depth(value: Any, most: int) -> None:
     level, depth = [value], 0
     while level := [p for v in level for p in (v.values() if isinstance(v, dict) else v if isinstance(v, list) else ())]:
         depth += 1
-        if depth > most:
-            raise SchemaError(f"is nested deeper than {most} lists and objects")
+        expect(depth <= most, f"is nested deeper than {most} lists and objects")
 
 
 def anything(value: Any, place: str) -> None:
@@ -169,13 +166,12 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
     def check(value: Any, place: str) -> None:
         _must(isinstance(value, dict), value, place, "an object")
         for name in needed:
-            if name not in value:
-                raise SchemaError(f"{place}.{name}".lstrip(".") + " is missing")
+            expect(name in value, f"{place}.{name}".lstrip(".") + " is missing")
         for name, item in value.items():
             if name in known:
                 known[name](item, f"{place}.{name}".lstrip("."))
-            elif not others:
-                raise SchemaError(f"{place}.{name[:40]}".lstrip(".") + " is unknown")
+            else:
+                expect(others, f"{place}.{name[:40]}".lstrip(".") + " is unknown")
 
     return check
 

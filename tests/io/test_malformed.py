@@ -92,7 +92,7 @@ def test_lens_models_distortion_and_points_of_binary_files(tmp_path):
         cameras.write_bytes(cameras.read_bytes()[:12] + struct.pack("<i", model) + cameras.read_bytes()[16:])
         refused(tmp_path, rf"cameras.bin: camera model {name} is not supported. Run `colmap image_undistorter")
     scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 1e300))
-    refused(tmp_path, r"camera 1: distortion .*1e\+300")
+    refused(tmp_path, r"camera 1: .*distortion .*1e\+300")
     for k1 in (1e-320, 5e-324, -1e-320, 1e-100):
         scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, k1)))
         assert scene.views[0].mask is None
@@ -144,8 +144,8 @@ def patched_pose(tmp_path, **changes):
 @pytest.mark.parametrize(
     "changes,message",
     [
-        ({"_5": "nan"}, r"images.txt, image 'photo1.png': the pose is not finite"),
-        ({"_5": "1e400"}, r"images.txt, image 'photo1.png': the pose is not finite"),
+        ({"_5": "nan"}, r"images.txt, image 'photo1.png': .*the pose is not finite"),
+        ({"_5": "1e400"}, r"images.txt, image 'photo1.png': .*the pose is not finite"),
         ({"_1": "0", "_2": "0", "_3": "0", "_4": "0"}, r"'photo1.png': the rotation quaternion .* is zero or not finite"),
         ({"_1": "1e308"}, r"'photo1.png': the rotation quaternion .* is zero or not finite"),
         ({"_2": "x"}, r"images.txt, line 4: cannot be understood \(could not convert"),
@@ -190,7 +190,7 @@ def test_images_without_a_finite_pose_or_camera_are_left_out(number, what, kind,
     note = "left out: 1 of 5 images, as pose or camera is not finite: photo2.png"
     assert note in scene.notes and len(scene.points) == 3 and not any("have no pose" in n for n in scene.notes)
     assert (len((read := read_cameras(folder))[0]), read[1]) == (4, [note])
-    refused(tmp_path, "the pose is not finite" if what == "pose" else r"camera 2: focal lengths \[(nan|inf)", strict=True)
+    refused(tmp_path, "the pose is not finite" if what == "pose" else r"camera 2: .*focal lengths \[(nan|inf)", strict=True)
 
 
 @pytest.mark.parametrize("kind", ["txt", "bin", "ply"])
@@ -276,8 +276,8 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
 @pytest.mark.parametrize(
     "changes,message",
     [
-        ({"transform_matrix": MIRROR}, r"transforms.json, frame 1 \(images/photo1.png\): the pose mirrors .*determinant -1"),
-        ({"transform_matrix": SCALED}, r"frame 1 \(images/photo1.png\): the pose is not rigid"),
+        ({"transform_matrix": MIRROR}, r"transforms.json, frame 1 \(images/photo1.png\): .*the pose mirrors .*determinant -1"),
+        ({"transform_matrix": SCALED}, r"frame 1 \(images/photo1.png\): .*the pose is not rigid"),
         ({"transform_matrix": np.array(scenes.opengl(1)).T.tolist()}, r"frame 1 .*the last row of the pose is .*transposed"),
         ({"transform_matrix": [[1, 2], [3]]}, r"frame 1 .*: transform_matrix is missing or not made of rows"),
         ({"transform_matrix": [[10**400] * 4] * 4}, r"frame 1 .*: transform_matrix is missing or not made of rows"),
@@ -294,7 +294,7 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
         ({"mask_path": "../m.png"}, r"frame 1 .*, mask: '../m.png' points outside the scene folder"),
         ({"mask_path": "m.png"}, r"frame 1 .*: its mask .*m.png is missing; restore it, or remove mask_path"),
         ({"file_path": "images/photo0.png"}, r"the image 'images/photo0.png' is listed twice"),
-        ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be over 0."),
+        ({"fl_x": -1}, r"frame 1 .*: .*focal lengths \[-1.0, 20.0\] px"),
         ({"fl_x": True}, r"frame 1 .*: not a number .fl_x must be a finite number, not True"),
         ({"fl_x": 10**400}, r"frame 1 .*: not a number .fl_x must be a finite number"),
         ({"cx": "8"}, r"frame 1 .*: not a number .cx must be a finite number, not '8'.; write it without quotes"),
@@ -302,8 +302,8 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
             ({"fl_x": n}, rf"frame 1 .*: not a number .fl_x must be a finite number, not {n}")
             for n in (np.nan, np.inf, -np.inf)
         ),
-        ({"transform_matrix": [[np.nan] * 4] * 4}, r"frame 1 .*: the pose is not finite"),
-        ({"w": 0}, r"frame 1 .*: the camera's image size 0 x 12 px is impossible"),
+        ({"transform_matrix": [[np.nan] * 4] * 4}, r"frame 1 .*: .*the pose is not finite"),
+        ({"w": 0}, r"frame 1 .*: impossible .the camera's image size 0 x 12 px"),
         ({"w": 30}, r"photo1.png: the image is 16 x 12 px, its camera 30 x 12"),
         ({"k4": 0.1}, r"frame 1 .*: k4 is not supported"),
         ({"k4": 0.1, "camera_model": "FULL_OPENCV"}, r"frame 1 .*: k4 is not supported"),
@@ -357,12 +357,12 @@ def test_no_focal_length_and_names_that_no_file_has(tmp_path):
 @pytest.mark.parametrize(
     "column,value,message",
     [
-        (3, np.nan, r"poses_bounds.npy, image 'photo2.png': the pose is not finite"),
-        (0, 5.0, r"poses_bounds.npy, image 'photo2.png': the pose is not rigid"),
-        (14, 0.0, r"'photo2.png': focal lengths"),
-        (4, -12.0, r"'photo2.png': the camera's image size"),
+        (3, np.nan, r"poses_bounds.npy, image 'photo2.png': .*the pose is not finite"),
+        (0, 5.0, r"poses_bounds.npy, image 'photo2.png': .*the pose is not rigid"),
+        (14, 0.0, r"'photo2.png': .*focal lengths"),
+        (4, -12.0, r"'photo2.png': .*the camera's image size"),
         (9, 99.0, r"photo2.png: the image is 16 x 12 px, its camera 99 x 12"),
-        ([0, 5, 10], "mirrored", r"'photo2.png': the pose mirrors the scene \(determinant -1\); two axes are probably swapped"),
+        ([0, 5, 10], "mirrored", r"'photo2.png': .*the pose mirrors the scene \(determinant -1\)"),
     ],
 )
 def test_llff_rows(column, value, message, tmp_path):
@@ -435,7 +435,7 @@ def test_dtu_archives(changes, message, tmp_path):
         ("photo1.png 20.0", "photo1.png nan", r"tiny_par.txt, line 3, image 'photo1.png': needs 21 finite numbers"),
         ("photo1.png 20.0", "photo1.png", r"line 3, image 'photo1.png': needs 21 finite numbers"),
         ("photo1.png 20.0 0.0", "photo1.png 20.0 3.0", r"line 3, image 'photo1.png': the camera is skewed by 3 px"),
-        ("photo1.png 20.0", "photo1.png -20.0", r"line 3, image 'photo1.png': focal lengths"),
+        ("photo1.png 20.0", "photo1.png -20.0", r"line 3, image 'photo1.png': .*focal lengths"),
         ("photo1.png 20.0", "photo9.png 20.0", r"photo9.png: the image cannot be read .No such"),
         ("photo1.png 20.0", "../photo1.png 20.0", r"line 3, image '../photo1.png': '../photo1.png' points outside"),
         ("5.5 0.0 0.0 1.0", "5.5 0.0 0.1 1.0", r"image 'photo0.png': K is not a matrix of intrinsics"),
@@ -467,13 +467,13 @@ BOMB = f'<?xml version="1.0"?><!DOCTYPE document [<!ENTITY e0 "ha">{ENTITIES}]><
         (lambda s: s.replace("<f>20.0</f>", "<f>20.0</f><k4>0.1</k4>"), "sensor 0: k4 of a frame camera is not supported"),
         (lambda s: s.replace("<f>20.0</f>", "<f>20.0</f><b2>3</b2>"), "sensor 0: b2 of a frame camera is not supported"),
         (lambda s: s.replace("<f>20.0</f>", "<f>nan</f>"), "sensor 0: cannot be understood .<f> needs 1 finite numbers"),
-        (lambda s: s.replace("<f>20.0</f>", ""), "sensor 0: focal lengths .0.0, 0.0. px must be over"),
+        (lambda s: s.replace("<f>20.0</f>", ""), "sensor 0: .*focal lengths .0.0, 0.0. px"),
         (lambda s: s.replace("<f>20.0</f>", "<f>-20</f>"), "focal lengths .* calibrate again"),
         (lambda s: s.replace('sensor id="0"', 'sensor id="1"'), "sensor 0: cannot be understood .it has no calibration; align"),
         (lambda s: s.replace('type="frame"', 'type="spherical"'), "sensor 0: spherical cameras are not supported"),
         (lambda s: s.replace('width="16"', 'width="x"'), "sensor 0: cannot be understood .invalid literal"),
         (lambda s: s.replace("<scale>2.0", "<scale>0"), "camera 'photo0': cannot be understood .its scale is 0"),
-        (lambda s: s.replace("<rotation>0.0 -1.0", "<rotation>0.0 -3.0"), "camera 'photo0': the pose is not rigid"),
+        (lambda s: s.replace("<rotation>0.0 -1.0", "<rotation>0.0 -3.0"), "camera 'photo0': .*the pose is not rigid"),
         (lambda s: s.replace("</transform></camera>", " 1</transform></camera>"), "photo0': .*<transform> needs 16 finite"),
         (lambda s: s.replace("UTF-8", "UTF-9"), "unknown encoding: UTF-9"),
         (lambda s: s.replace("</group>", "</group><camera sensor_id='0'><transform/></camera>"), "<transform> needs 16 finite"),
@@ -498,9 +498,9 @@ def test_metashape_files(change, message, tmp_path):
             "0,0,0",
             r"calib.csv, line 3: cannot be understood \(zip\(\) argument .*; write the file again",
         ),
-        (",0,0,0,0,0,0,0,0", ",0,0,nan,0,0,0,0,0", "distortion .* of the Brown lens is impossible"),
-        (",0,0,0,0,0,0,0,0", ",1e300,0,0,0,0,0,0,0", "line 3, image 'photo0.png': the principal point"),
-        (",45.0,", ",-45.0,", "image 'photo0.png': focal lengths"),
+        (",0,0,0,0,0,0,0,0", ",0,0,nan,0,0,0,0,0", "distortion .* of the Brown lens"),
+        (",0,0,0,0,0,0,0,0", ",1e300,0,0,0,0,0,0,0", "line 3, image 'photo0.png': .*the principal point"),
+        (",45.0,", ",-45.0,", "image 'photo0.png': .*focal lengths"),
         ("photo0.png,", "photo0.png,x,", "line 3: cannot be understood"),
         ("photo1.png", "photo0.png", "'photo0.png' is listed twice"),
         ("photo1.png", "../a.png", "points outside the scene folder"),

@@ -148,10 +148,10 @@ def test_normals_in_both_axes(tmp_path, suffix):
 
 BAD = {
     "size": (RAMP[:, :-3], r"13 x 12 px, its image 16 x 12; give a map of the whole image"),
-    "empty": (np.zeros(SHAPE, np.uint16), "contains no depth"),
+    "empty": (np.zeros(SHAPE, np.uint16), "all values are 0"),
     "negative": (-RAMP.astype(np.float32), r"192 depths are negative, down to -2910"),
-    "nan": (np.full(SHAPE, np.nan, np.float32), "no depth is finite"),
-    "infinite": (np.full(SHAPE, np.inf, np.float32), "no depth is finite"),
+    "nan": (np.full(SHAPE, np.nan, np.float32), "all values are 0 or not finite"),
+    "infinite": (np.full(SHAPE, np.inf, np.float32), "all values are 0 or not finite"),
     "huge": (np.full(SHAPE, 1e20, np.float32), "beyond 1e"),
     "picture": (np.stack([RAMP, RAMP, RAMP + 1], -1), "colour image of 3 channels"),
     "bits": (RAMP.astype(np.uint8) | 1, "has 8 bits"),
@@ -159,7 +159,7 @@ BAD = {
     "words": (np.full(SHAPE, "a"), "its numbers are"),
     "axes": (np.zeros((2, 3, 4, 5), np.float32), "must be an array"),
     "vectors": (2 * facing(), "100% of its vectors are not unit normals"),
-    "none": (0 * facing(), "contains no normals"),
+    "none": (0 * facing(), "every pixel is black"),
     "one channel": (facing()[..., 0], "not of three channels"),
 }
 
@@ -343,7 +343,7 @@ def test_ids_are_not_guessed_and_masks_that_cannot_be_used_are_named(tmp_path):
     """Matching by sorted order would give later views their neighbour's mask; images 1 to 5 and masks 0 to 5 match twice."""
     scenes.write_colmap(tmp_path / "dtu", names=RECT)
     write_masks(tmp_path / "dtu" / "idrmasks", [0, 1, 3, 4])
-    refused(tmp_path / "dtu", r"no mask for image id 2 .* rect_001_... is id 0")
+    refused(tmp_path / "dtu", r"no mask for image id 2\).* rect_001_... is id 0")
     scene = scenes.write_colmap(tmp_path / "own", names=tuple(f"{i + 1:03d}.png" for i in range(scenes.VIEWS)))
     write_masks(scene / "idrmasks", range(6))
     refused(scene, "count from 0, or remove mask 0")
@@ -351,7 +351,7 @@ def test_ids_are_not_guessed_and_masks_that_cannot_be_used_are_named(tmp_path):
     write_masks(scene / "idrmasks", range(5))
     refused(scene, "no mask for image id 5")
     scene, folder = scenes.write_colmap(tmp_path / "scene"), tmp_path / "m"  # none, without numbers, of another shape, black
-    refused(scene, "contains no masks", score_masks=folder)
+    refused(scene, "contains none", score_masks=folder)
     for name in "abcde":
         scenes.save(folder / f"{name}.png", mask_of(0))
     refused(scene, "no distinct numbers", score_masks=folder)

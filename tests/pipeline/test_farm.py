@@ -605,5 +605,5 @@ def test_a_cluster_that_is_named_is_joined(started, monkeypatch, by_variable):
         raise ConnectionError("no route")
 
     monkeypatch.setattr(sys.modules["ray"], "init", fail)
-    with pytest.raises(ResourceError, match="Ray at head:6379 does not answer: no route; check RAY_ADDRESS"):
+    with pytest.raises(ResourceError, match="Ray at head:6379 does not answer \\(no route\\); check RAY_ADDRESS"):
         RayEngine("cpu", 1, 1, address="head:6379")

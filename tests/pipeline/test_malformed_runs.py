@@ -154,7 +154,7 @@ def test_a_record_with_a_value_that_cannot_be(made, run, path, value, words):
     """Both who opens the run and who continues it read it through the same schema; the place is named."""
     put_record(run, replaced(made[1], path, value))
     for read in (read_record, open_run):
-        with pytest.raises(DataError, match=rf"config\.json: incomplete or damaged: .*{words}"):
+        with pytest.raises(DataError, match=rf"config\.json: incomplete or damaged \(.*{words}"):
             read(run)
 
 

@@ -252,10 +252,10 @@ def run(tmp_path_factory):
     return fit, out, seen
 
 
-def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 320) -> np.ndarray:
+def tile(sheet: np.ndarray, index: int, view, width: int = 320) -> np.ndarray:
     """The pixels of one tile of a sheet of five columns."""
     height = round(width * view.camera.height / view.camera.width)
-    head, top = round(text * CONTACT_HEAD), CONTACT_MARGIN + round(text * TITLE_SIZE) + 18
+    head, top = CONTACT_HEAD, CONTACT_MARGIN + TITLE_SIZE + 18
     x, y = CONTACT_MARGIN + index % 5 * (width + CONTACT_GAP), top + head + index // 5 * (head + height + CONTACT_GAP)
     return sheet[y : y + height, x : x + width]
 

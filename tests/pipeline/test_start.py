@@ -72,7 +72,7 @@ def test_every_confirmed_pixel_becomes_a_point():
     assert np.allclose(pixels, np.stack([columns, rows], 1) + 0.5, atol=1e-4)
     assert np.allclose(z, depths[0].depth[rows, columns])
     assert np.array_equal(cloud.colors[first], views[0].image[rows, columns])
-    assert notes[0] == f"000.png: {100 * depths[0].coverage:.0f} % of pixels by flow"
+    assert notes[0] == f"000.png: {100 * depths[0].valid.mean():.0f} % of pixels by flow"
     assert notes[-1] == f"{len(cloud):,} points from {len(cloud):,} pixels by flow, 0 filled in"
 
 

@@ -54,7 +54,7 @@ def test_keypoints_are_in_pixels_of_the_photograph(tmp_path):
         ((AT, SCORES, UNIT), {"named": "x"}, "lacks the output scores; give a file of `warpgs priors export --model xfeat`"),
         ((AT, SCORES, UNIT), {"size": (64, "w")}, "fixes only one side"),
         ((AT[:2], SCORES, UNIT), {}, r"returned keypoints \[2, 2\], scores \[3\]"),
-        ((AT, SCORES, UNIT[:, :0]), {}, "have 0 numbers, not 1 to 256"),
+        ((AT, SCORES, UNIT[:, :0]), {}, "have 0 numbers"),
         ((AT, SCORES, np.ones((3, 300))), {}, "have 300 numbers"),
         ((AT * np.nan, SCORES, UNIT), {}, "contain NaN"),
         ((AT * 100, SCORES, UNIT), {}, "keypoints must be in the image"),

@@ -112,11 +112,11 @@ def test_a_fitted_map_that_is_not_exact_fills_gaps_and_replaces_outliers():
     bent = [given(v, 3 / (d * bend) + 1, "disparity") for v, d in zip(views, depths)]
     for d, before in zip(combined(bent)[0], swept()):
         changed = before.valid & (d.depth != before.depth)
-        assert d.coverage > before.coverage + 0.05 and changed.mean() < 0.12
+        assert d.valid.mean() > before.valid.mean() + 0.05 and changed.mean() < 0.12
         assert np.abs(d.depth[changed] / before.depth[changed] - 1).min() > 0.04
     close = [given(v, 3 / d + 1, "disparity") for v, d in zip(views, depths)]
     for d, true in zip(combined(close)[0], depths):
-        assert d.coverage > 0.98 and np.median(error(d, true)) < 0.005
+        assert d.valid.mean() > 0.98 and np.median(error(d, true)) < 0.005
 
 
 def test_metric_depth_comes_before_searched_depth_and_sparse_or_uncertain_depth_joins_it():
@@ -125,7 +125,7 @@ def test_metric_depth_comes_before_searched_depth_and_sparse_or_uncertain_depth_
     noisy = [d * (1 + 0.01 * rng.standard_normal(d.shape)) for d in depths]
     found, notes = combined([given(v, d) for v, d in zip(views, noisy)])
     for d, true, before in zip(found, depths, swept()):
-        assert d.coverage > 0.98 > before.coverage and np.median(error(d, true)) < 0.008
+        assert d.valid.mean() > 0.98 > before.valid.mean() and np.median(error(d, true)) < 0.008
         assert np.isfinite(d.sensitivity[d.valid]).all()
     assert "used in 3 of 3 views; median difference" in notes[0]
     sparse = [np.where(rng.random(d.shape) < 0.02, d, 0) for d in depths]

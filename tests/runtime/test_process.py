@@ -402,11 +402,13 @@ def test_names_that_are_no_text_for_output_libraries_and_films(tmp_path, monkeyp
     assert utf8_name(tmp_path / "plain") == str(tmp_path / "plain")
     with pytest.raises(UsageError, match=r"b\\xe4ü/file: the name is not UTF-8"):
         utf8_name(folder / "file")
-    # OpenCV ended the process at such a name; a film is written and checked
-    path = tmp_path / "films" / BYTES / f"{BYTES}.mp4"
-    path.parent.mkdir(parents=True)
+    # OpenCV ended the process at such a name; a film is written and checked, also where temporary files have such a name
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
     frames = [np.full((16, 16, 3), 0.2 * i, np.float32) for i in range(3)]
-    assert write_film(path, frames) == 3 and [p.name for p in path.parent.iterdir()] == [path.name]
+    for suffix in (".mp4", ".webm"):
+        path = tmp_path / suffix / BYTES / f"{BYTES}{suffix}"
+        path.parent.mkdir(parents=True)
+        assert write_film(path, frames) == 3 and [p.name for p in path.parent.iterdir()] == [path.name]
 
 
 def rename_an_image(scene: Path) -> str:

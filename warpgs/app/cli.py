@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import warpgs.clock  # noqa: F401, imported first: its time stands for the start of the process
 from warpgs import process
 from warpgs.device import is_out_of_memory, keep_all_freed_memory, no_memory_message, wake_gpu
-from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
+from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean, explained
 from warpgs.folders import system_folder
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 from warpgs.plugins import own_frame
@@ -186,10 +186,8 @@ def _run(arguments: list[str]) -> int:
         return 0
     name = arguments[0]
     try:
-        try:
-            os.getcwd()
-        except OSError as e:  # torch's libraries end the process there
-            raise UsageError("the current folder was deleted; change to another one") from e
+        with explained("the current folder was deleted", "change to another one", kind=UsageError):
+            os.getcwd()  # torch's libraries end the process there
         if name not in COMMANDS:
             hint = did_you_mean(OTHER_WORDS.get(name.lower(), name), COMMANDS, 0.8) or f"choose one of {', '.join(COMMANDS)}"
             raise UsageError(f"unknown command {name!r}; {hint}")
@@ -216,7 +214,3 @@ def _run(arguments: list[str]) -> int:
         if is_out_of_memory(e):
             return last_words(f"warpgs: {no_memory_message(e)}", ResourceError.exit_code)
         return report_defect(e, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

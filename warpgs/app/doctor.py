@@ -263,11 +263,8 @@ def run(arguments: list[str], about: str) -> int:
             waiting()("compiling kernels")
             print_warming()
             return 0
-        stages = Stages()
-        stages("checking this machine")
-        with fast_imports():
-            findings = diagnose(waiting())
-        stages.clear()
+        with Stages() as tell, fast_imports():
+            findings = diagnose(tell)
         return print_report(findings)
 
     return call(doctor, arguments, "warpgs doctor", about)

@@ -1,7 +1,5 @@
 """gsplat 1.6.0's `rasterization` and what its callers need, on our rasterizer: change `gsplat` to `warpgs.compat.gsplat`."""
 
-from __future__ import annotations
-
 import enum
 import functools
 from collections import UserDict

@@ -1,7 +1,5 @@
 """diff-gaussian-rasterization's classes on our rasterizer: change `diff_gaussian_rasterization` to `warpgs.compat.inria`."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import torch

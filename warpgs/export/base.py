@@ -405,11 +405,6 @@ class Format:
         return gaussians_of(path, arrays, lambda: self.strict or self.is_own(path), self.notes)
 
 
-def warn_of_antialiasing(path: Path) -> None:
-    """Warn that the Gaussians of a file are antialiased; the warning points to the caller of the reading function."""
-    warnings.warn(f"{path}: its Gaussians are antialiased; render them with RasterizeOptions(antialiased=True)", stacklevel=3)
-
-
 FORMATS: Registry[Format] = Registry("format", Format, __package__)
 """File formats of Gaussians by name; those in the modules of `warpgs.export` are built in."""
 register = register_format = FORMATS.register
@@ -570,11 +565,15 @@ def read_gaussians(
         warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
     """
-    gaussians, antialiased, notes = read_with_antialiasing(Path(path), normalization, units, format, strict)
-    if antialiased:
-        warn_of_antialiasing(Path(path))
-    for note in notes:
-        warnings.warn(note, stacklevel=2)
+    return read_with_warnings(Path(path), normalization, units, format, strict)
+
+
+def read_with_warnings(path: Path, *how: Any) -> Gaussians:
+    """Read Gaussians with the arguments of `read_with_antialiasing`; warnings point to the caller of the calling function."""
+    gaussians, antialiased, notes = read_with_antialiasing(path, *how)
+    words = f"{path}: its Gaussians are antialiased; render them with RasterizeOptions(antialiased=True)"
+    for note in [words] * antialiased + notes:
+        warnings.warn(note, stacklevel=3)
     return gaussians
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.export.base import origin_comment
 from warpgs.export.gltf import buffer_of, glb, linear
 from warpgs.files import filling, is_empty, make_folder, write_bytes, write_json, write_text
@@ -38,10 +38,9 @@ def write_mesh(
     """
     path, origin = Path(path), np.zeros(3) if origin is None else origin
     check_suffix(path)
-    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all()):
-        raise DataError(f"{path}: not written, the mesh holds numbers that are not finite; make it again")
-    if mesh.faces.size and not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)):
-        raise DataError(f"{path}: not written, a triangle refers to a missing vertex; make the mesh again")
+    with explained(f"{path}: not written", "make the mesh again", ValueError):
+        expect(np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all(), "it holds numbers that are not finite")
+        expect(((mesh.faces >= 0) & (mesh.faces < len(mesh.vertices))).all(), "a triangle refers to a missing vertex")
     turn = None if up is None else rotation_to_y(up, ahead)
     write_bytes(path, *(_ply(mesh, origin) if path.suffix.lower() == ".ply" else _glb(path, mesh, turn, origin)))
 

@@ -4,7 +4,6 @@ import itertools
 import math
 import os
 import re
-import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -328,16 +327,10 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
             has one that is not usable; the message names the place.
         warpgs.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
-    path, kind = Path(path), PLY()
     normalization = geometry.checked_normalization(normalization, units, str(path))
-    if is_compressed(start_of(path)):
+    if is_compressed(start_of(Path(path))):
         raise DataError(f"{path}: is a compressed PLY file, which read_ply does not read; use warpgs.export.read_gaussians")
-    gaussians = kind.read(path, normalization, units)
-    if kind.is_antialiased(path):
-        base.warn_of_antialiasing(path)
-    for note in kind.notes:
-        warnings.warn(note, stacklevel=2)
-    return gaussians
+    return base.read_with_warnings(Path(path), normalization, units, PLY)
 
 
 def _plain(path: Path, file: BinaryIO, notes: list[str]) -> base.Arrays:

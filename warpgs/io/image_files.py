@@ -400,7 +400,7 @@ def _check_tiff(data: bytes) -> None:
 def unpacked_size(packed: memoryview, limit: int) -> int:
     """Return the number of bytes in a zlib stream whose checksum matches; ValueError if it is damaged or exceeds ``limit``."""
     stream, total = zlib.decompressobj(), 0
-    try:
+    with _decoder("its compressed pixels are damaged ({})"):
         for at in range(0, len(packed), INPUT_PIECE):  # zlib copies all that is left of its input each time
             left: bytes | memoryview = packed[at : at + INPUT_PIECE]
             while left and total <= limit and not stream.eof:
@@ -408,8 +408,6 @@ def unpacked_size(packed: memoryview, limit: int) -> int:
                 left = stream.unconsumed_tail
         while not stream.eof and total <= limit and (more := stream.decompress(b"", PIECE)):
             total += len(more)
-    except zlib.error as e:
-        raise ValueError(f"its compressed pixels are damaged ({e})") from e
     expect(stream.eof, f"its compressed pixels {'end early' if total <= limit else 'are more than it announces'}")
     return total
 

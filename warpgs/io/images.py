@@ -1,7 +1,5 @@
 """Images of a scene: decoded, turned as the camera was, resized, masked."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable
@@ -13,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from warpgs import geometry
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.io.image_files import MAX_PIXELS, decode, read_exif, read_image_file
 from warpgs.scene import DEPTH_KINDS, GivenDepth, View
 from warpgs.schema import Checked
@@ -148,21 +146,19 @@ class Lens:
     fisheye: bool = False
     """True for OpenCV's fisheye model."""
 
-    def checked(self, where: str) -> Lens:
+    def checked(self, where: str) -> "Lens":
         """Return this lens after a check of its numbers; ``where`` names file and image in errors.
 
         Raises:
             DataError: A number is not finite, not positive or too large.
         """
         f, c = self.K[[0, 1], [0, 1]], self.K[:2, 2]
-        if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
-            raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")
-        if not ((f >= MIN_FOCAL * np.array([self.width, self.height])) & (f < MAX_INTRINSIC)).all():
-            raise DataError(f"{where}: focal lengths {f.tolist()} px must be over {MIN_FOCAL} of the sides; calibrate again")
-        if not (np.abs(c) < MAX_INTRINSIC).all():
-            raise DataError(f"{where}: the principal point {c.tolist()} px is not finite or too large; calibrate again")
-        if not (np.abs(self.distortion) < MAX_DISTORTION).all():
-            raise DataError(f"{where}: distortion {self.distortion} of the {self.model} lens is impossible; calibrate again")
+        size, terms = np.array([self.width, self.height]), self.distortion
+        with explained(f"{where}: impossible", "calibrate again, or fix the file", ValueError):
+            expect(((size >= 1) & (size <= MAX_INTRINSIC)).all(), f"the camera's image size {self.width} x {self.height} px")
+            expect(((f >= MIN_FOCAL * size) & (f < MAX_INTRINSIC)).all(), f"focal lengths {f.tolist()} px")
+            expect((np.abs(c) < MAX_INTRINSIC).all(), f"the principal point {c.tolist()} px is not finite or too large")
+            expect((np.abs(terms) < MAX_DISTORTION).all(), f"distortion {terms} of the {self.model} lens")
         return self
 
 

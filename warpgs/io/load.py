@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError, did_you_mean, explained, listed, similar_folder
+from warpgs.errors import DataError, UsageError, did_you_mean, expect, explained, listed, similar_folder
 from warpgs.geometry import camera_extent, matmul, near_cameras
 from warpgs.io import folder as scenes
 from warpgs.io.folder import Probe, Reader, SceneFolder
@@ -296,18 +296,18 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     inner = folder / "mask"
     folder = inner if inner.is_dir() else folder
     files = list_images(folder) if folder.is_dir() else []
-    if not files:
-        raise DataError(f"{folder}: contains no masks; name the folder that contains 000.png, 001.png, ... with --score-masks")
-    numbers, ids = scenes.image_ids([f.name for f in files]), scenes.image_ids([v.name for v in views])
-    if numbers is None:
-        raise DataError(f"{folder}: the masks have no distinct numbers; name them 000.png, 001.png, ... by id")
+    names = [v.name for v in views]
+    numbers, ids = scenes.image_ids([f.name for f in files]) or [], scenes.image_ids(names) or []
     masks = dict(zip(numbers, files))
-    if ids is None:
-        raise DataError(f"{folder}: masks have image ids, the images ({views[0].name}, ...) no distinct ones; name them by id")
-    if missing := sorted(set(ids) - set(masks)):
-        raise DataError(f"{folder}: no mask for image id {listed(missing, 8)} (an image rect_001_... is id 0); restore it")
-    if min(ids) == 1 and 0 in masks and not scenes.named_by_dtu([v.name for v in views]):
-        raise DataError(f"{folder}: the images start with 1, the masks with 0; let both count from 0, or remove mask 0")
+    fix = "give a folder with 000.png, 001.png, ... by image id to --score-masks (an image rect_001_... is id 0)"
+    with explained(f"{folder}: these masks do not fit", fix, ValueError):
+        expect(files, "the folder contains none")
+        expect(numbers, "the masks have no distinct numbers")
+        expect(ids, f"the images ({names[0]}, ...) have no distinct numbers")
+        missing = sorted(set(ids) - set(masks))
+        expect(not missing, f"no mask for image id {listed(missing, 8)}")
+        shifted = min(ids) == 1 and 0 in masks and not scenes.named_by_dtu(names)
+        expect(not shifted, "the images start with 1, the masks with 0: let both count from 0, or remove mask 0")
     done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]) > 0.5, v)) for i, v in zip(ids, views)]
     return done, f"scores use only pixels inside the masks in {folder}, matched by image id; the fit ignores these masks"
 
@@ -471,8 +471,6 @@ def _exclusions(options: ReadOptions, names: list[str]) -> list[str]:
     return [f"left out by --exclude: {len(out)} image{'s' if len(out) != 1 else ''}: {listed(out)}"] if out else []
 
 
-MAX_FOCAL = 100
-"""Largest usual focal length as a multiple of the longer side: a field of view of 0.6 degrees."""
 MIN_BASELINE = 1e-3
 """Spread of the cameras, as a fraction of their distance from the points, below which parallax is less than a pixel."""
 
@@ -498,12 +496,6 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
             distance = float(np.median(np.linalg.norm(points.points - middle, axis=1)))
     if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
         notes.append(f"all cameras are within {spread:.2g} units of one place, without depth: move between photographs")
-    off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
-    if off:
-        notes.append(f"principal points of {len(off)} views, as of {off[0].name}, are outside the image; calibrate again")
-    narrow = [v for v in views if not v.camera.K[0, 0] <= MAX_FOCAL * max(v.camera.width, v.camera.height)]
-    if narrow:
-        notes.append(f"focal lengths of {len(narrow)} views, as of {narrow[0].name}, are over {MAX_FOCAL} sides; check them")
     # most photographs differ, and vary, in a few pixels already
     equal: dict[bytes, list[str]] = {}
     few = [v.image[::SPARSE, ::SPARSE] for v in views]

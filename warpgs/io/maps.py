@@ -119,20 +119,14 @@ def read_depth(path: Path, options: ReadOptions) -> np.ndarray:
     metric = options.depth_kind == "metric"
     if raw.dtype == np.uint8 and metric:
         raise DataError(f"{path}: has 8 bits, too few for metric depth; save 16, or give --depth-kind relative or disparity")
-    values = raw.astype(np.float32)
-    finite = np.isfinite(values)
-    if not finite.any():
-        raise DataError(f"{path}: no depth is finite; write the map again, or remove the file")
-    values = np.where(finite, values, 0)
-    if (values < 0).any():
-        raise DataError(f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; mark gaps by 0")
+    values = np.where(np.isfinite(raw), raw, 0).astype(np.float32)
     if metric:
         with np.errstate(over="ignore"):
             values = values * np.float32(options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0))
-    if not values.any():
-        raise DataError(f"{path}: contains no depth, all values are 0 or not finite; remove the file: maps are optional")
-    if not values.max() < MAX_DEPTH:
-        raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; use 0 for missing values")
+    with explained(f"{path}: no depth map", "write it again with 0 for gaps, or remove it: maps are optional", ValueError):
+        expect(values.any(), "all values are 0 or not finite")
+        expect(values.min() >= 0, f"{int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}")
+        expect(values.max() < MAX_DEPTH, f"depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}")
     return values
 
 
@@ -165,11 +159,10 @@ def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(np.where(usable[..., None], values, 0), axis=-1)
     known = usable & (lengths >= NO_NORMAL)
-    if not known.any():
-        raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
-    stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
-    if not stray <= MAX_STRAY:
-        raise DataError(f"{path}: {stray:.0%} of its vectors are not unit normals; save PNG as (n + 1) / 2, or NPY as it is")
+    with explained(f"{path}: no normals", "save (n + 1) / 2 as PNG, or n as NPY, or remove it: maps are optional", ValueError):
+        expect(known.any(), "every pixel is black, not finite or short")
+        stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
+        expect(stray <= MAX_STRAY, f"{stray:.0%} of its vectors are not unit normals")
     known &= np.abs(lengths - 1) <= UNIT_TOLERANCE
     normals = np.where(known[..., None], values / np.where(known, lengths, 1)[..., None], 0).astype(np.float32)
     if options.normal_axes == "opengl":

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpgs import schema
-from warpgs.errors import DataError, explained
+from warpgs.errors import DataError, expect, explained
 from warpgs.files import is_within, read_file
 from warpgs.geometry import matmul, pose_of, seen_pixels
 from warpgs.io import colmap, folder as scenes
@@ -368,8 +368,7 @@ def _drawn(path: Path, values: dict[str, Any]) -> Iterator[Row]:
         with explained(f"{where}: needs camera_to_world, fov, render_width and render_height", "export it again", PARSING):
             pose = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
             width, height, fov = int(values["render_width"]), int(values["render_height"]), float(frame["fov"])
-            if not 0 < fov < 180:
-                raise ValueError("fov")
+            expect(0 < fov < 180, "fov")
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov))
         lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
         yield f"{i:05d}", scenes.from_camera_to_world(pose, where, opengl=True), lens.checked(where)

@@ -10,7 +10,7 @@ import torch
 
 from warpgs.device import available_bytes, format_bytes
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.geometry import evenly_spaced, in_image, matmul, pinhole_of, project_points
+from warpgs.geometry import evenly_spaced, in_image, inside, pinhole_of, project_points
 from warpgs.kernels.launch import MAX_SIZE
 from warpgs.kernels.tsdf import gather_colors, integrate
 from warpgs.mesh.views import DEPTHS, SAMPLES, SurfaceView, SurfaceViews, agreed, depth_map, neighbours, sample_surface
@@ -78,12 +78,6 @@ def subject(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     for camera in map(pinhole_of, cameras):
         counts += in_image(camera, points)
     return counts >= min(SUBJECT * len(cameras), counts.max(initial=0))
-
-
-def inside(points: np.ndarray, box: Box) -> np.ndarray:
-    """Mask [N] of the points [N, 3] in a box."""
-    center, size, rotation = box
-    return (np.abs(matmul(points - center, rotation)) <= np.asarray(size) / 2).all(1)
 
 
 def plan_grid(

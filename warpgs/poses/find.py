@@ -99,24 +99,15 @@ SHOWN_PARTNERS = 5
 """Largest number of matched photographs that the record names for a photograph."""
 FEW = 5
 """Largest number of photographs for which a focal length without EXIF is called uncertain (decision 017)."""
-_PHOTOGRAPH = schema.fields(
-    {
-        "name": schema.text, "sha256": schema.text, "registered": schema.flag, "keypoints": schema.whole(0),
-        "points": schema.whole(0), "matches": schema.mapping(schema.whole(1)), "reason": schema.or_null(schema.text),
-    },
-)  # fmt: skip
-_RECORD = schema.fields(
-    {
-        "format": schema.one_of(FORMAT), "source_sha256": schema.text, "photographs": schema.items(_PHOTOGRAPH),
-        "notes": schema.items(schema.text), "advice": schema.items(schema.text),
-        "mean_reprojection_error_px": schema.number(0), "points": schema.whole(0),
-        "method": schema.one_of("incremental", "global"), "pairs_tried": schema.whole(0), "pairs_matched": schema.whole(0),
-        "cameras": schema.items(schema.fields({
-            "focal": schema.number(above=0), "distortion": schema.number(), "width": schema.whole(1), "height": schema.whole(1),
-        })), "pycolmap": schema.text,
-    },
-    {"source": schema.text},
-)  # fmt: skip
+_PHOTOGRAPH = schema.fields({
+    "name": schema.text, "registered": schema.flag, "keypoints": schema.whole(0), "points": schema.whole(0),
+    "matches": schema.mapping(schema.whole(1)), "reason": schema.or_null(schema.text),
+})  # fmt: skip
+_RECORD = schema.fields({
+    "format": schema.one_of(FORMAT), "source_sha256": schema.text, "photographs": schema.items(_PHOTOGRAPH),
+    "notes": schema.items(schema.text), "advice": schema.items(schema.text),
+}, {"source": schema.text})  # fmt: skip
+"""Schema of what is read of poses.json."""
 
 
 USUAL = (0.4, 2.5)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, expect, explained
 from warpgs.files import replacing
 from warpgs.io.image_files import decode_png
 from warpgs.onnx import Model, fixed_size
@@ -136,16 +136,15 @@ class Matcher(Model):
         """Raise a DataError if the outputs are not keypoints of an image of ``h`` x ``w`` px."""
         shapes = ", ".join(f"{n} {list(a.shape)}" for n, a in zip(OUTPUTS, (keypoints, scores, descriptors)))
         count = len(scores) if scores.ndim == 1 else -1
-        if keypoints.shape != (count, 2) or descriptors.ndim != 2 or len(descriptors) != count:
-            raise DataError(f"{self.path}: returned {shapes}, not K x 2, K and K x D numbers; export it again")
-        if not 0 < descriptors.shape[1] <= MAX_CHANNELS:
-            raise DataError(f"{self.path}: its descriptors have {descriptors.shape[1]} numbers, not 1 to {MAX_CHANNELS}")
-        if not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in (keypoints, scores, descriptors)):
-            raise DataError(f"{self.path}: its outputs contain NaN or infinity, or are not floating-point; check its weights")
-        there = scores > 0
-        inside = (keypoints >= 0) & (keypoints <= [w, h])
-        if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
-            raise DataError(f"{self.path}: keypoints must be in the image, descriptors of length 1; export it again")
+        with explained(f"{self.path}: its outputs are unusable", "check its weights, or export it again", ValueError):
+            fit = keypoints.shape == (count, 2) and descriptors.ndim == 2 and len(descriptors) == count
+            expect(fit, f"it returned {shapes}, not K x 2, K and K x D numbers")
+            expect(0 < descriptors.shape[1] <= MAX_CHANNELS, f"descriptors have {descriptors.shape[1]} numbers")
+            sound = all(a.dtype.kind == "f" and np.isfinite(a).all() for a in (keypoints, scores, descriptors))
+            expect(sound, "they contain NaN or infinity, or are not floating-point")
+            there, inside = scores > 0, (keypoints >= 0) & (keypoints <= [w, h])
+            placed = inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()
+            expect(placed, "keypoints must be in the image, descriptors of length 1")
 
 
 def mutual_matches(a: np.ndarray, b: np.ndarray) -> np.ndarray:

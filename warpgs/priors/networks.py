@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError, explained
+from warpgs.errors import DataError, ResourceError, expect, explained
 from warpgs.files import read_input, write_bytes
 from warpgs.folders import cache_home, private_folder
 from warpgs.onnx import Model, fixed_size
@@ -74,31 +74,28 @@ class Network(Model):
 
     def __init__(self, path: str | Path, provider: str = "cpu", threads: int = 0):
         super().__init__(path, provider, threads)
-        for what, names in (("input", [name for name, _, _ in self.inputs]), ("output", self.outputs)):
-            if len(names) != 1:
-                raise DataError(f"{path}: it has {len(names)} {what}s ({', '.join(names)}); export it with only one")
-        ((_, kind, shape),) = self.inputs
-        if kind not in TYPES:
-            raise DataError(f"{path}: its input is a {kind}; float or float16 is needed")
-        dims, text = [d if isinstance(d, int) and d > 0 else None for d in shape], " x ".join(map(str, shape))
-        if len(dims) != 4 or dims[0] not in (1, None):
-            raise DataError(f"{path}: its input is {text}, not one image, 1 x 3 x height x width or 1 x height x width x 3")
-        self.layout = "nchw" if dims[1] == 3 or (dims[1] is None and dims[3] != 3) else "nhwc"
-        if self.layout == "nhwc" and dims[3] != 3:
-            raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of images")
+        with explained(f"{path}: not a network of one image", "export it with one input and one output", ValueError):
+            for what, names in (("input", [name for name, _, _ in self.inputs]), ("output", self.outputs)):
+                expect(len(names) == 1, f"it has {len(names)} {what}s ({', '.join(names)})")
+            ((_, kind, shape),) = self.inputs
+            expect(kind in TYPES, f"its input is a {kind}; float or float16 is needed")
+            dims, text = [d if isinstance(d, int) and d > 0 else None for d in shape], " x ".join(map(str, shape))
+            image = len(dims) == 4 and dims[0] in (1, None)
+            expect(image, f"its input is {text}, not 1 x 3 x height x width or 1 x height x width x 3")
+            self.layout = "nchw" if dims[1] == 3 or (dims[1] is None and dims[3] != 3) else "nhwc"
+            colors = self.layout == "nchw" or dims[3] == 3
+            expect(colors, f"neither the second nor the last axis of its input, {text}, has the 3 channels of images")
         self.type = TYPES[kind]
         self.size = fixed_size(self.path, dims[2:] if self.layout == "nchw" else dims[1:3])
 
     def run(self, image: np.ndarray) -> np.ndarray:
         """Return the output, float32 of any shape, for one prepared image [h, w, 3]."""
         (output,) = self.outputs_of((image if self.layout == "nhwc" else image.transpose(2, 0, 1))[None].astype(self.type))
-        if output.dtype.kind != "f":
-            raise DataError(f"{self.path}: its output is of type {output.dtype}, not scores; leave argmax out of the export")
-        output = output.astype(np.float32)
-        if not np.isfinite(output).all():
-            raise DataError(f"{self.path}: its output holds NaN or infinity; check mean and standard deviation, or its weights")
-        if output.size == 0 or not output.max() > output.min():
-            raise DataError(f"{self.path}: its output is the same number everywhere; check the model's weights")
+        fix = "check its weights, mean and standard deviation, and leave argmax out of the export"
+        with explained(f"{self.path}: its output is unusable", fix, ValueError):
+            expect(output.dtype.kind == "f", f"it is of type {output.dtype}, not scores")
+            expect(np.isfinite(output := output.astype(np.float32)).all(), "it holds NaN or infinity")
+            expect(output.size and output.max() > output.min(), "it is the same number everywhere")
         return output
 
 
@@ -205,17 +202,14 @@ class MapCache:
     """A folder of maps; ``notes`` report damaged entries, which are computed again, and a folder that cannot be written."""
 
     def __init__(self, folder: Path):
-        self.folder, self.notes, self.found, self.made = folder, list[str](), 0, 0
+        self.folder, self.notes = folder, list[str]()
 
     def maps(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], Arrays]) -> Arrays:
         """Return one map per name, float32 [H, W], of an image [H, W, 3], read from disk or computed by ``make``."""
         path = self._path(image, names, decided_by)
-        if (maps := self._read(path, names, image.shape[:2])) is not None:
-            self.found += 1
-            return maps
-        maps = make()
-        self.made += 1
-        self._write(path, names, maps)
+        if (maps := self._read(path, names, image.shape[:2])) is None:
+            maps = make()
+            self._write(path, names, maps)
         return maps
 
     def _path(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict) -> Path:
@@ -230,16 +224,15 @@ class MapCache:
 
         try:
             stored = load(read_input(path))
+            maps = tuple(stored[n] for n in names)
+            sound = (m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps)
+            expect(all(sound), "it is damaged")
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:
             self.notes.append(f"{path}: a stored map could not be read ({e}) and was computed again")
             return None
-        maps = tuple(stored.get(n) for n in names)
-        if all(m is not None and m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps):
-            return maps
-        self.notes.append(f"{path}: a stored map was damaged and was computed again")
-        return None
+        return maps
 
     def _write(self, path: Path, names: tuple[str, ...], maps: Arrays) -> None:
         from safetensors.numpy import save

@@ -63,23 +63,6 @@ class PhotoCheck:
     channels: tuple[float, float, float] | None
     """Red, green and blue relative to the other photographs."""
 
-    @property
-    def blurred(self) -> bool:
-        """True if the photograph is clearly less sharp than others."""
-        return self.sharpness is not None and self.sharpness < MIN_SHARPNESS
-
-    @property
-    def exposed_otherwise(self) -> bool:
-        """True if the photograph is clearly darker or brighter than others."""
-        return self.brightness is not None and not 1 / MAX_BRIGHTNESS <= self.brightness <= MAX_BRIGHTNESS
-
-    @property
-    def tinted(self) -> bool:
-        """True if the white balance clearly differs from other photographs."""
-        if self.channels is None or self.brightness is None:
-            return False
-        return any(not 1 / MAX_TINT <= c / self.brightness <= MAX_TINT for c in self.channels)
-
 
 Places = tuple[Features, np.ndarray, np.ndarray]
 """Features of a photograph, the logarithm of fine over coarse detail [N] and the mean colours [N, 3] in [0, 1] around them."""
@@ -148,16 +131,18 @@ def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
 
 def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
     """Return notes on photographs with faults, and on photographs that could not be compared; an empty list without any."""
-    blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
-    exposed = sorted((c for c in checks if c.exposed_otherwise), key=lambda c: -abs(math.log(c.brightness)))
-    tints = [(c.name, *c.channels) for c in checks if c.tinted]
+    blurred = sorted((c for c in checks if c.sharpness is not None and c.sharpness < MIN_SHARPNESS), key=lambda c: c.sharpness)
+    known = [c for c in checks if c.brightness is not None]
+    exposed = [c for c in known if not 1 / MAX_BRIGHTNESS <= c.brightness <= MAX_BRIGHTNESS]
+    exposed.sort(key=lambda c: -abs(math.log(c.brightness)))
+    tints = [(c.name, c.channels) for c in known if any(not 1 / MAX_TINT <= k / c.brightness <= MAX_TINT for k in c.channels)]
     faults = (
         ("less detail than in other photographs of the same places, probably blur", "look at them, and remove blurred ones",
          [f"{c.name} ({c.sharpness:.2f} x as sharp)" for c in blurred]),
         ("exposure differs from neighbouring photographs", REMEDY,
          [f"{c.name} ({c.brightness:.2f} x as bright)" for c in exposed]),
         ("white balance differs from neighbouring photographs", REMEDY,
-         [f"{name} (red {red:.2f}, green {green:.2f}, blue {blue:.2f} x)" for name, red, green, blue in tints]),
+         [f"{name} (red {red:.2f}, green {green:.2f}, blue {blue:.2f} x)" for name, (red, green, blue) in tints]),
     )  # fmt: skip
     notes: list[str] = [Task(f"{what}: {listed(named, MAX_NAMED)}; {remedy}") for what, remedy, named in faults if named]
     alone = [c.name for c in checks if not c.compared_with]

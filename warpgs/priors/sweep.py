@@ -1,7 +1,6 @@
 """Depth by plane sweep: which views to compare, which planes, and the depth that fits best."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -321,17 +320,13 @@ def _reduced(view: View) -> View:
     """Return the view, resized to at most `MAX_PIXELS` where it is larger."""
     import cv2
 
-    c = view.camera
-    shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
-    if shrink == 1.0:
+    small = geometry.resized(view.camera, min(1.0, (MAX_PIXELS / (view.camera.width * view.camera.height)) ** 0.5))
+    if small is view.camera:
         return view
-    width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
-    K = np.diag([width / c.width, height / c.height, 1]) @ c.K
-    image = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
-    mask = view.mask
+    size, mask = (small.width, small.height), view.mask
     if mask is not None:
-        mask = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    return View(view.name, replace(c, K=K, width=width, height=height), image, mask)
+        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return View(view.name, small, cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), mask)
 
 
 def consistent_depth(views: dict[int, View], inverses: dict[int, np.ndarray], index: int, others: Sequence[int]) -> ViewDepth:

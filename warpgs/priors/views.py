@@ -1,7 +1,5 @@
 """What networks say of each view: depth and saliency."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -248,7 +246,4 @@ def view_priors(
     for i in counted(range(len(views)), tell, "finding disparity", "views"):
         (confidence, boundary, foreground, source), ((d,), where) = maps[i], disparity(i)
         priors.append(Prior(d, confidence, boundary, foreground, where, source))
-    notes += cache.notes
-    if cache.found:
-        notes.append(Detail(f"priors: {cache.found} of {cache.found + cache.made} maps read from the cache {cache.folder}"))
-    return priors, notes
+    return priors, notes + cache.notes

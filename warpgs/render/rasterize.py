@@ -1,7 +1,5 @@
 """The rasterizer: `rasterize` checks what it is given, renders it, and `select_rule` measures its rules."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
@@ -14,7 +12,7 @@ from torch import Tensor
 
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
 from warpgs.device import free_for
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, expect, explained
 from warpgs.kernels import launch
 from warpgs.kernels.blend import blend
 from warpgs.kernels.blend_cuda import image_tile
@@ -233,7 +231,7 @@ def _checked_channels(name: str, values: Tensor | None, inputs: ProjectInputs) -
     return values if values.ndim == 3 else values[None]
 
 
-def _check_memory(window: Window, layers: list[Layer], heaviest: int, like: Tensor) -> None:
+def _check_memory(window: Window, layers: "list[Layer]", heaviest: int, like: Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
     # and alpha, depth, transmittance, sum of weights
     channels = sum(backgrounds.shape[1] + 4 for _, backgrounds in layers) + 2 * heaviest
@@ -467,15 +465,12 @@ def select_rule(
         UsageError: No rule keeps the limit, ``cameras`` is empty or a single camera, ``max_error`` is not a positive number, or
             the measure is unknown.
     """
-    if not (isinstance(max_error, Real) and 0 < max_error < math.inf):
-        raise UsageError(f"max_error must be a positive number, such as 0.002, not {max_error!r}")
-    if measure not in MEASURES:
-        raise UsageError(f"measure {measure!r} is not one of {', '.join(MEASURES)}")
-    if isinstance(cameras, Camera):
-        raise UsageError("select_rule takes a list of cameras, not one: give [camera]")
-    views, error = list(cameras), 0.0
-    if not views:
-        raise UsageError("select_rule measures errors in views: give at least one camera")
+    with explained("select_rule cannot choose", "correct this argument", ValueError, UsageError):
+        positive = isinstance(max_error, Real) and 0 < max_error < math.inf
+        expect(positive, f"max_error must be a positive number, such as 0.002, not {max_error!r}")
+        expect(measure in MEASURES, f"measure {measure!r} is not one of {', '.join(MEASURES)}")
+        views, error = [] if isinstance(cameras, Camera) else list(cameras), 0.0
+        expect(views, "give a list of at least one camera: [camera]")
     for rule in FASTEST_FIRST:
         error, own = 0.0, replace(options, rule=rule, error_bound=True)
         for camera in views:

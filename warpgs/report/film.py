@@ -15,7 +15,7 @@ from PIL import Image
 from warpgs.device import in_background, usable_cores
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import replacing, write_bytes
-from warpgs.folders import temporary_folder
+from warpgs.folders import open_folder, temporary_folder
 from warpgs.process import fed_program, hidden_stderr, run_program, utf8_name
 
 ANIMATIONS = (".webp", ".gif")
@@ -168,8 +168,8 @@ def _encode_vp9(path: Path, temporary: str, frames: Iterator[np.ndarray], fps: i
         encoder.release()
         return name
 
-    with temporary_folder() as made:
-        folder = utf8_name(made.path)
+    with temporary_folder() as made, open_folder(made.path) as opened:
+        folder = utf8_name(opened.reachable())
         parts = iter(lambda: list(itertools.islice(frames, size)), [])
         for name in in_background(encode, ((f"{folder}/{i}.mp4", p) for i, p in enumerate(parts)), threads):
             packets = cv2.VideoCapture(name, cv2.CAP_FFMPEG, (cv2.CAP_PROP_FORMAT, -1))

@@ -16,9 +16,9 @@ MAX_WEBP_SIDE = 16383
 
 
 def png(image: np.ndarray) -> bytes:
-    """Encode colours in [0, 1], [H, W, 3] or with straight alpha [H, W, 4], as 8-bit PNG; values outside are clamped."""
+    """Encode values in [0, 1], grey [H, W], RGB or RGBA [H, W, C], as PNG of 8 bits a channel; values outside are clamped."""
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    return _encoded(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
+    return _encoded(".png", pixels if pixels.ndim == 2 else pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
 
 
 def _encoded(suffix: str, pixels: np.ndarray, options: Sequence[int] = ()) -> bytes:
@@ -186,33 +186,30 @@ def _dotted(image, centers: np.ndarray):
     return image
 
 
-def contact_sheet(
-    title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
-) -> np.ndarray:
+def contact_sheet(title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440) -> np.ndarray:
     """Arrange labelled tiles of one size in rows, with lines of text; colours [rows, columns, 3]."""
     height, width = tiles[0].values.shape[:2]
     tile_height = max(1, round(tile_width * height / width))
     cells = len(tiles) + bool(lines)
     rows = -(-cells // columns)
-    label_size, text_size, title_size, head = (round(text * v) for v in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE, CONTACT_HEAD))
-    top = CONTACT_MARGIN + title_size + 18
+    top = CONTACT_MARGIN + TITLE_SIZE + 18
     across = 2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP
-    down = top + rows * (head + tile_height) + (rows - 1) * CONTACT_GAP + CONTACT_MARGIN
+    down = top + rows * (CONTACT_HEAD + tile_height) + (rows - 1) * CONTACT_GAP + CONTACT_MARGIN
     sheet = Image.new("RGB", (across, down), CONTACT_PAPER)
     draw = ImageDraw.Draw(sheet)
-    fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
-    draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[title_size])
+    fonts = {s: ImageFont.load_default(s) for s in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE)}
+    draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[TITLE_SIZE])
     for i in range(cells):
         x = CONTACT_MARGIN + (i % columns) * (tile_width + CONTACT_GAP)
-        y = top + (i // columns) * (head + tile_height + CONTACT_GAP)
+        y = top + (i // columns) * (CONTACT_HEAD + tile_height + CONTACT_GAP)
         if i == len(tiles):
-            draw.line((x, y + head, x + tile_width - 1, y + head), CONTACT_LINE)
-            characters = int(tile_width / (0.5 * text_size))
+            draw.line((x, y + CONTACT_HEAD, x + tile_width - 1, y + CONTACT_HEAD), CONTACT_LINE)
+            characters = int(tile_width / (0.5 * TEXT_SIZE))
             words = "\n\n".join(textwrap.fill(line, characters) for line in lines)
-            draw.multiline_text((x, y + head + 14), words, CONTACT_SOFT, fonts[text_size], spacing=5)
+            draw.multiline_text((x, y + CONTACT_HEAD + 14), words, CONTACT_SOFT, fonts[TEXT_SIZE], spacing=5)
             break
         tile = tiles[i]
-        label = tile.label[: int(tile_width / (0.5 * label_size))]
-        draw.text((x, y + head // 5), label, CONTACT_INK, fonts[label_size])
-        sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + head))
+        label = tile.label[: int(tile_width / (0.5 * LABEL_SIZE))]
+        draw.text((x, y + CONTACT_HEAD // 5), label, CONTACT_INK, fonts[LABEL_SIZE])
+        sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + CONTACT_HEAD))
     return np.asarray(sheet, np.float32) / 255

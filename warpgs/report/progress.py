@@ -1,7 +1,5 @@
 """Progress of a fit, on the terminal and as a log of events."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import itertools

@@ -11,6 +11,7 @@ from warpgs.errors import ResourceError, UsageError, explained
 from warpgs.files import filling, is_empty, make_folder, write_bytes
 from warpgs.geometry import look_at, matmul, pose_of
 from warpgs.process import Say, counted, silent
+from warpgs.report.images import png
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 from warpgs.synthetic.raycast import Box, Cylinder, Light, Plane, Shape, Sphere, Texture, Torus
@@ -235,7 +236,7 @@ def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int =
         shapes, light, cameras = still_life(seed), Light(), camera_path(views, width, height)
         files = {}
         for i, c in enumerate(counted(cameras, tell, "rendering", "views")):
-            files[f"images/{i:03d}.png"] = _png(raycast.render(shapes, light, c.K, c.viewmat, width, height))
+            files[f"images/{i:03d}.png"] = png(raycast.render(shapes, light, c.K, c.viewmat, width, height))
         tell("finding points")
         return files | _colmap(shapes, light, cameras, seed)
 
@@ -386,14 +387,6 @@ def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
     return cameras
 
 
-def _png(image: np.ndarray) -> bytes:
-    """Return an image with values in [0, 1], RGB [H, W, 3], RGBA [H, W, 4] or grey [H, W], as PNG of 8 bits a channel."""
-    import cv2
-
-    order = image if image.ndim == 2 else image[..., [2, 1, 0, 3][: image.shape[2]]]
-    return bytes(cv2.imencode(".png", np.round(255 * order).astype(np.uint8))[1].tobytes())
-
-
 def _transforms(cameras: list[Camera]) -> str:
     """Return the text of a transforms.json: camera-to-world with OpenGL axes, the lens as a horizontal angle."""
     first, frames = cameras[0], []
@@ -417,10 +410,10 @@ def write_object(
             color, alpha = over_black[..., :3], over_black[..., 3:]
             color = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
             if form == "transforms":
-                files[f"images/{name}"] = _png(np.concatenate([color, alpha], axis=2))
+                files[f"images/{name}"] = png(np.concatenate([color, alpha], axis=2))
             else:
-                files[f"images/{name}"] = _png(np.where(alpha > 0, color, np.float32(0.5)))
-                files[f"masks/{name}"] = _png(alpha[..., 0])
+                files[f"images/{name}"] = png(np.where(alpha > 0, color, np.float32(0.5)))
+                files[f"masks/{name}"] = png(alpha[..., 0])
         if form == "transforms":
             return files | {"transforms.json": _transforms(cameras).encode()}
         return files | _colmap(shapes, LIGHT, cameras, seed, MAX_POINTS)

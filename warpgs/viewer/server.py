@@ -18,10 +18,10 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
 from warpgs import schema
-from warpgs.errors import DataError, ResourceError, WarpgsError, install_extras
+from warpgs.errors import DataError, ResourceError, WarpgsError, expect, explained, install_extras
 from warpgs.process import Say, say
 from warpgs.ranks import HOST, Allowance, WebGuard, loopback_socket
-from warpgs.schema import Schema, SchemaError
+from warpgs.schema import Schema
 
 if TYPE_CHECKING:
     import viser
@@ -119,15 +119,13 @@ MAX_TEXT = 4096
 
 def _short(value: Any, place: str) -> None:
     schema.text(value, place)
-    if len(value) > MAX_TEXT:
-        raise SchemaError(f"{place} must be at most {MAX_TEXT} letters long")
+    expect(len(value) <= MAX_TEXT, f"{place} must be at most {MAX_TEXT} letters long")
 
 
 def _rotation(value: Any, place: str) -> None:
     """Allow unit quaternions."""
     schema.items(schema.number(-1.01, high=1.01), 4)(value, place)
-    if abs(math.hypot(*value) - 1) > 0.01:
-        raise SchemaError(f"{place} must be a unit quaternion")
+    expect(abs(math.hypot(*value) - 1) <= 0.01, f"{place} must be a unit quaternion")
 
 
 def _value(value: Any, place: str) -> None:
@@ -175,19 +173,12 @@ def read_frame(frame: bytes | str) -> dict[str, Any]:
 
     if not isinstance(frame, bytes) or len(frame) > MAX_FRAME:
         raise DataError(f"a message must be binary and at most {MAX_FRAME} bytes long")
-    try:
+    with explained("a message is malformed", "reload the page", (ValueError, TypeError, RecursionError)):
         message = msgspec.msgpack.decode(frame)
-    except (ValueError, TypeError, RecursionError) as e:
-        raise DataError(f"a message is not MessagePack: {e}") from e
-    if not isinstance(message, dict) or not all(isinstance(name, str) for name in message):
-        raise DataError("a message is not an object with names")
-    kind = message.pop("type", None)
-    if not isinstance(kind, str) or kind not in MESSAGES:
-        raise DataError(f"a message has the unknown type {str(kind)[:60]!r}")
-    try:
+        expect(isinstance(message, dict) and all(isinstance(name, str) for name in message), "it is not an object with names")
+        kind = message.pop("type", None)
+        expect(isinstance(kind, str) and kind in MESSAGES, f"its type {str(kind)[:60]!r} is unknown")
         MESSAGES[kind](message, kind)
-    except SchemaError as e:
-        raise DataError(f"a message is malformed: {e}") from e
     return {"type": kind, **message}
 
 

@@ -287,8 +287,8 @@ def overwriting(context, rows, value=0.0):
     "make, message",
     [
         (lambda c: grown(c, 41), "makes 101 Gaussians of 60, but max_gaussians and the memory limit allow 100; add at most"),
-        (lambda c: grown(c, 2, value=math.nan), r"added\['means'\] has 1 non-finite values"),
-        (lambda c: grown(c, 2, value=math.inf), r"added\['means'\] has 1 non-finite values"),
+        (lambda c: grown(c, 2, value=math.nan), "rows of means have non-finite values"),
+        (lambda c: grown(c, 2, value=math.inf), "rows of means have non-finite values"),
         (lambda c: grown(c, 1, keep=[0, 1, 1, 2]), "keep holds a row twice"),
         (lambda c: grown(c, 1, keep=[1, 2, 1]), "keep holds a row twice"),
         (lambda c: grown(c, 1, keep=[0, 60]), "keep must be from 0 to 59"),
@@ -296,7 +296,7 @@ def overwriting(context, rows, value=0.0):
         (lambda c: grown(c, 1, parent=60), "parents must be from -1 to 59"),
         (lambda c: overwriting(c, [3, 3]), "overwritten holds a row twice"),
         (lambda c: overwriting(c, [60]), "overwritten must be from 0 to 59"),
-        (lambda c: overwriting(c, [1], math.nan), r"values\['means'\] has 3 non-finite values"),
+        (lambda c: overwriting(c, [1], math.nan), "rows of means have non-finite values"),
         (lambda c: DensityUpdate(torch.ones(60, dtype=torch.bool)), "keep must be an int64 tensor of one axis"),
     ],
 )

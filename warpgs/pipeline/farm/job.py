@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, get_type_hints
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.files import input_digest, read_file, write_json
 from warpgs.io.folder import READERS, all_readers
 from warpgs.pipeline.run.folder import CONFIG
@@ -61,10 +61,9 @@ def job_of(text: str) -> FarmJob:
     if scene.reader is not None:
         READERS.load(scene.reader)
     for place in v["own_code"]:  # a class of a preset's file cannot be imported by its name
-        try:
+        fix = "put it where all processes can import it"
+        with explained(f"your code {place} cannot be imported", fix, (ImportError, OSError), UsageError):
             module_of(place)
-        except (ImportError, OSError) as e:
-            raise UsageError(f"your code {place} cannot be imported ({e}); put it where all processes can import it") from e
     STRATEGIES.load(config["strategy"])
     for registry, key in ((LOSS_TERMS, "loss_terms"), (VIEW_MODULES, "view_modules")):
         for part in config[key]:
@@ -155,13 +154,11 @@ def _read(path: Path) -> list[ListedJob]:
     for number, line in enumerate(data.splitlines(), 1):
         if not line.strip():
             continue
-        try:
+        with explained(f"{path}, line {number}: not a job", 'write {"scene": FOLDER, "steps": 500}', schema.SchemaError):
             values = schema.parse(line)
             _LINE(values, "")
             scene = Path(os.path.abspath(path.parent / values.pop("scene")))
             found.append((values.pop("name", scene.name), scene, tuple(_flag(key, value) for key, value in values.items())))
-        except schema.SchemaError as e:
-            raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
     return found
 
 
@@ -171,16 +168,15 @@ _LINE = schema.fields({"scene": schema.text}, {"name": schema.text})
 def _flag(key: str, value: Any) -> str:
     """Return a setting of a line as an argument of a command line."""
     name = key.replace("_", "-")
-    if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
-        raise schema.SchemaError(f"{key[:40]!r} cannot be set for a single job")
+    own = re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) and name not in FARM_FLAGS
+    expect(own, f"{key[:40]!r} cannot be set for a single job")
     if isinstance(value, bool):
         group, dot, last = name.rpartition(".")
         return f"--{name}" if value else f"--{group}{dot}no-{last}"
-    if not isinstance(value, (str, int, float)):
-        raise schema.SchemaError(f"{key[:40]} must be text, a number, true or false")
+    expect(isinstance(value, (str, int, float)), f"{key[:40]} must be text, a number, true or false")
     schema.text(str(value), key[:40])
-    if name in PLUGINS and ":" in str(value):
-        raise schema.SchemaError(f"{key} names user code; give it as --{name} on the command line of the farm")
+    code = name in PLUGINS and ":" in str(value)
+    expect(not code, f"{key} names user code; give it as --{name} on the command line of the farm")
     return f"--{name}={value}"
 
 

@@ -9,7 +9,7 @@ import os
 import secrets
 from typing import Any
 
-from warpgs.errors import ResourceError, UsageError, install_extras
+from warpgs.errors import ResourceError, UsageError, explained, install_extras
 from warpgs.folders import private_folder
 from warpgs.pipeline.farm.job import Event, FarmJob
 from warpgs.pipeline.farm.work import run_job
@@ -27,10 +27,8 @@ class RayEngine:
         if address == "local":  # Ray asks for a token unless RAY_AUTH_MODE says otherwise; without this it keeps one in ~/.ray
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
             os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # on every system, Ray listens at the loopback address then
-        try:
+        with explained("--engine ray needs Ray, which is not installed", install_extras("ray"), ImportError, UsageError):
             import ray
-        except ImportError as e:
-            raise UsageError(f"--engine ray needs Ray, which is not installed; {install_extras('ray')}") from e
         self._ray, self._threads = ray, threads
         if not ray.is_initialized():
             _connect(ray, address)
@@ -71,10 +69,8 @@ def _connect(ray: Any, address: str) -> None:
     """Join a cluster, or start one with its sockets in a private folder, because Ray's default folders have mode 0777."""
     # The address is never read from ``/tmp/ray``, where other users can write.
     own = {"include_dashboard": False, "_temp_dir": str(private_folder() / "ray")} if address == "local" else {}
-    try:
+    remedy = "set TMPDIR to a folder with a short path" if own else "check RAY_ADDRESS and RAY_AUTH_TOKEN"
+    with explained(f"Ray at {address} does not answer", remedy, (OSError, RuntimeError, ValueError), ResourceError):
         ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
-    except (OSError, RuntimeError, ValueError) as e:
-        remedy = "set TMPDIR to a folder with a short path" if own else "check RAY_ADDRESS and RAY_AUTH_TOKEN"
-        raise ResourceError(f"Ray at {address} does not answer: {e}; {remedy}, or leave out --engine ray") from e
     if own:  # where Ray was imported before us it listens at every interface
         say_what_is_open(listeners())

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from warpgs.device import background
-from warpgs.errors import UsageError, did_you_mean, listed
+from warpgs.errors import UsageError, did_you_mean, expect, explained, listed
 from warpgs.files import make_folder, write_bytes
-from warpgs.geometry import convert_camera, pinhole_of
+from warpgs.geometry import convert_camera
 from warpgs.locks import hold_file, hold_folder
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films import paths
@@ -84,8 +84,6 @@ VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 MIN_FRAMES_PER_VIEW = 4
 """Fewest frames from one training view to the next; a film with too few frames skips some of the views."""
 MAX_FRAMES = 1_000_000
-WIDER = 1.02
-"""A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
 AT_VIEWS = "score each view with `warpgs eval`; --coverage marks these places"
 """Advice for frames at training views."""
 
@@ -110,16 +108,13 @@ class FilmSettings:
 
     def __post_init__(self) -> None:
         """Check what can be checked before any work."""
-        low, high = paths.LIMITS["width"]
-        if self.size is not None and not all(low <= s <= high for s in self.size):
-            raise UsageError(f"each side of a film must have {low} to {high} px, not {self.size[0]} x {self.size[1]}")
-        low, high = paths.LIMITS["fov"]
-        if self.fov_y is not None and not math.radians(low) <= self.fov_y <= math.radians(high):
-            raise UsageError(f"--fov must be {low:g} to {high:g} degrees, not {math.degrees(self.fov_y):g}")
-        if self.seconds is not None and not 0 < self.seconds * self.fps <= MAX_FRAMES:
-            raise UsageError(f"a film must be longer than 0 s and have at most {MAX_FRAMES:,} frames, not {self.seconds:g} s")
-        if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
-            raise UsageError(f"a film must have 1 to {MAX_FRAMES:,} frames, not {self.frames}")
+        (least, most), (low, high) = paths.LIMITS["width"], paths.LIMITS["fov"]
+        with explained("a film cannot be so", "give another value", ValueError, UsageError):
+            expect(all(least <= s <= most for s in self.size or ()), f"sides must have {least} to {most} px, not {self.size}")
+            fits = self.fov_y is None or math.radians(low) <= self.fov_y <= math.radians(high)
+            expect(fits, f"--fov must be {low:g} to {high:g} degrees")
+            counts = self.frames, self.seconds and self.seconds * self.fps
+            expect(all(n is None or 0 < n <= MAX_FRAMES for n in counts), f"it must have 1 to {MAX_FRAMES:,} frames")
 
     def count(self, seconds: float) -> int:
         """Return the number of frames of a film; ``seconds`` is its duration if the settings have none."""
@@ -192,42 +187,26 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
             raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
         shown = [(names[n], paths.framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
-        return FilmPlan(shown, coverage, AT_VIEWS, _cropped(train[0], settings))
+        return FilmPlan(shown, coverage, AT_VIEWS, [])
     rig = paths.rig_of(train, depth, model.normalization.up)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
         remedy = "move the keyframes nearer to the photographs; c2w is in OpenCV axes, in the units of the scene's files"
         return FilmPlan(_numbered(cameras), coverage, remedy, [words])
     notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
-    if rig.turned:
-        notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
     kind = paths.path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         far = [c for c in train if not 0 < rig.reach(c) < paths.CLOSE * rig.distance]
         left_out = len(train) - len(far) if path == "auto" and len(far) > 1 else 0
         cameras, words = _tour(rig, far if left_out else train, settings)
         words += f"; {left_out} close-ups are left out" * bool(left_out)
-        words += "; --path turntable is calmer" * (path == "auto" and rig.kind == "forward")
         remedy = AT_VIEWS
     else:
         cameras = paths.camera_path(kind, rig, train, settings.count(SECONDS))
         words = f"path: {kind}" + ", there and back over the captured area" * (rig.span is not None and kind == "turntable")
         remedy = "--path interpolate stays at the training views"
-    notes += _cropped(cameras[0], settings)
     cameras = [paths.framed(c, settings.size, settings.fov_y) for c in cameras]
     return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words])
-
-
-def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
-    """Return a line for the user on what frames of another shape do not show of a photograph."""
-    if settings.size is None or settings.fov_y is not None:
-        return []
-    camera = pinhole_of(camera)
-    zooms = settings.size[0] / camera.width, settings.size[1] / camera.height
-    whole = math.degrees(2 * math.atan(0.5 * settings.size[1] / (min(zooms) * camera.K[1, 1])))
-    shown = f"{min(zooms) / max(zooms):.0%} of their {'height' if zooms[0] > zooms[1] else 'width'}"
-    words = f"frames have another shape than the photographs, and show {shown}; --fov {whole:.0f} shows all"
-    return [words] * (max(zooms) > WIDER * min(zooms))
 
 
 def _numbered(cameras: list[Camera]) -> list[tuple[str, Camera]]:
@@ -244,16 +223,12 @@ COVERAGE = "coverage"
 
 def check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
-    if not plan.cameras:
-        raise UsageError("no camera to render; give at least one")
-    alone = out.suffix.lower() in SUFFIXES
-    if not alone and out.suffix and not out.is_dir():
-        raise UsageError(f"{out}: unknown film suffix; use {', '.join(SUFFIXES)}, or a folder without a suffix for images")
-    one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
-    if (alone or sheet) and not one_size:
-        raise UsageError(f"{out}: views differ in size, but a film or sheet needs one; give --size, or a folder, no --sheet")
-    if alone and coverage:
-        raise UsageError(f"{out}: coverage images are PNG files; give a folder instead of a film")
+    alone, one_size = out.suffix.lower() in SUFFIXES, len({(c.width, c.height) for _, c in plan.cameras}) == 1
+    with explained(f"{out}: cannot be rendered so", "give a folder, or leave out what it excludes", ValueError, UsageError):
+        expect(plan.cameras, "there is no camera")
+        expect(alone or not out.suffix or out.is_dir(), f"films end in {', '.join(SUFFIXES)}")
+        expect(one_size or not (alone or sheet), "views differ in size, but a film or sheet needs one: give --size")
+        expect(not (alone and coverage), "coverage images are PNG files in a folder")
     return alone, one_size
 
 

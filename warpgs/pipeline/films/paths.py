@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from warpgs import geometry, schema
-from warpgs.errors import DataError
-from warpgs.files import read_input, unread_reason
+from warpgs.errors import DataError, explained
+from warpgs.files import read_input
 from warpgs.scene import Camera, Normalization
 
 NAMES = {
@@ -413,11 +413,9 @@ KEYFRAMES = schema.items(schema.fields({
 
 def read_keyframes(path: Path, template: Camera, normalization: Normalization) -> list[Keyframe]:
     """Read keyframes of a JSON file (OpenCV camera-to-world, file units) into scene units, the first at 0 s."""
-    try:
+    with explained(f"{path}: no keyframes", "list objects of c2w (4 x 4), fov_y [rad], seconds", (OSError, schema.SchemaError)):
         values = schema.parse(read_input(path, MAX_BYTES))
         KEYFRAMES(values, "keyframes")
-    except (OSError, schema.SchemaError) as e:
-        raise DataError(f"{path}: no keyframes ({unread_reason(e)}); list objects of c2w (4 x 4), fov_y [rad], seconds") from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:
         raise DataError(f"{path}: holds {len(values)} keyframes; a path needs 1 to {MAX_KEYFRAMES:,}")
     K = np.array([[template.K[0, 0], 0, 0.5 * template.width], [0, template.K[1, 1], 0.5 * template.height], [0, 0, 1.0]])

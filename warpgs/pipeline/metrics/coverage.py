@@ -11,12 +11,12 @@ import torch
 from warpgs.constants import NEAR
 from warpgs.device import in_background
 from warpgs.files import make_folder, read_file, write_bytes
-from warpgs.geometry import check_pinhole, evenly_spaced, pinhole_of
+from warpgs.geometry import check_pinhole, evenly_spaced, pinhole_of, resized
 from warpgs.io.image_files import decode
 from warpgs.io.images import without_masked
 from warpgs.kernels.ssim import ssim
 from warpgs.mesh.views import MIN_ALPHA, TOLERANCE, depth_difference, seen_from
-from warpgs.pipeline.metrics.scores import Renders, psnr_of, resized, scored_pair
+from warpgs.pipeline.metrics.scores import Renders, psnr_of, scored_pair
 from warpgs.priors.given_depth import pinhole_view
 from warpgs.process import Say, counted, silent
 from warpgs.report.images import COVERAGE_LEGEND, channel_mean, coverage_image, png, webp

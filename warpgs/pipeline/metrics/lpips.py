@@ -13,8 +13,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from warpgs.errors import DataError, UsageError
-from warpgs.files import open_input, read_tensors, remove_leftovers, tensor_pieces, unread_reason, write_bytes
+from warpgs.errors import DataError, UsageError, expect, explained
+from warpgs.files import open_input, read_tensors, remove_leftovers, tensor_pieces, write_bytes
 
 FORMAT = "warpgs-lpips-1"
 TAP = ("tap",)
@@ -91,18 +91,12 @@ HEADS = {
 
 def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     """Return the tensors of a .pth file by name, and the file's SHA-256."""
-    try:
-        file = open_input(path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
-    with file:
-        try:
-            _check_unpacked(file)
-            # weights_only: tensors and plain containers, nothing that could run
-            state = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception as e:  # torch, pickle and zipfile raise a dozen types on malformed files
-            reason = f"{type(e).__name__}: {str(e).partition(os.linesep)[0][:120]}"
-            raise DataError(f"{path}: cannot be read as a torch state dict ({reason}); download it again") from e
+    # torch, pickle and zipfile raise a dozen types on malformed files
+    fix = "download it again, and give a .pth file with a state dict"
+    with explained(f"{path}: cannot be read as a torch state dict", fix, Exception), open_input(path) as file:
+        _check_unpacked(file)
+        # weights_only: tensors and plain containers, nothing that could run
+        state = torch.load(file, map_location="cpu", weights_only=True)
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if not isinstance(state, dict):
@@ -115,8 +109,7 @@ def _check_unpacked(file: BinaryIO) -> None:
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > file.seek(0, os.SEEK_END):
-            raise ValueError(f"it unpacks to {unpacked:,} bytes, more than its size")
+        expect(unpacked <= file.seek(0, os.SEEK_END), f"it unpacks to {unpacked:,} bytes, more than its size")
     file.seek(0)
 
 
@@ -163,14 +156,13 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     """Read a converted file: the network, its tensors by name (float32, CPU), and the header with the file's SHA-256."""
     fix = "write the file again with `warpgs convert-lpips`"
     tensors, metadata, data = read_tensors(path, "`warpgs convert-lpips` writes one", fix)
-    if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
-        raise DataError(f"{path}: holds no LPIPS weights; {fix}")
-    net = NETS[metadata["net"]]
-    for name, shape in net.shapes().items():
-        if name not in tensors or tuple(tensors[name].shape) != shape:
-            raise DataError(f"{path}: no {name} of shape {list(shape)}; {fix}")
-        if tensors[name].dtype != torch.float32 or not bool(torch.isfinite(tensors[name]).all()):
-            raise DataError(f"{path}: {name} is not finite float32; {fix}")
+    with explained(f"{path}: holds no LPIPS weights", fix, ValueError):
+        expect(metadata.get("format") == FORMAT and metadata.get("net") in NETS, "it names no format and network")
+        net = NETS[metadata["net"]]
+        for name, shape in net.shapes().items():
+            expect(name in tensors and tuple(tensors[name].shape) == shape, f"no {name} of shape {list(shape)}")
+            finite = tensors[name].dtype == torch.float32 and torch.isfinite(tensors[name]).all()
+            expect(finite, f"{name} is not finite float32")
     return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}
 
 

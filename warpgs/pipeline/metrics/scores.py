@@ -5,7 +5,7 @@ import threading
 import warnings
 from collections.abc import Iterable, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,7 +14,7 @@ import torch
 
 from warpgs.device import in_background
 from warpgs.errors import listed
-from warpgs.geometry import back_project, inverse, matmul, project_points
+from warpgs.geometry import back_project, inverse, matmul, project_points, resized
 from warpgs.io.images import dark_pixels, without_masked
 from warpgs.kernels.ssim import RADIUS, ssim
 from warpgs.kernels.update import squared_error
@@ -375,15 +375,6 @@ SMOOTHING = 32
 
 _Small = tuple[Camera, np.ndarray, np.ndarray, np.ndarray]
 """A view reduced to `MAX_PIXELS`: its camera, residuals, depths and the mask of its pixels that count, [H, W] each."""
-
-
-def resized(camera: Camera, factor: float) -> Camera:
-    """Return the camera of the image at another size, at least one pixel on each side."""
-    if factor == 1:
-        return camera
-    width, height = (max(1, int(factor * n)) for n in (camera.width, camera.height))
-    scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
-    return replace(camera, K=scale * camera.K, width=width, height=height)
 
 
 def _reduced(view: View, rgb: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> _Small:

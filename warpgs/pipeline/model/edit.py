@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpgs import schema
+from warpgs import geometry, schema
 from warpgs.constants import ALPHA_CUT
-from warpgs.errors import DataError, UsageError
-from warpgs.files import read_input, unread_reason
-from warpgs.geometry import matmul
+from warpgs.errors import UsageError, explained
+from warpgs.files import read_input
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.limits import NEEDLE, ROUNDING, long_axes
 from warpgs.pipeline.model.table import truncated
@@ -130,17 +129,16 @@ BOX = schema.fields({"center": _THREE, "size": _THREE}, {"rotation": schema.item
 def box_of(text: str) -> Box:
     """Return the box of a text: least and largest corner, x,y,z,X,Y,Z; or a .json file, as the viewer saves it."""
     if text.lower().endswith(".json"):
-        try:
+        fix = "save the box again in the viewer"
+        with explained(f"{text}: cannot be read as a box", fix, (OSError, schema.SchemaError)):
             values = schema.parse(read_input(Path(text), MAX_BOX_BYTES))
             BOX(values, "the box")
-        except (OSError, schema.SchemaError) as e:
-            raise DataError(f"{text}: cannot be read as a box ({unread_reason(e)}); save the box again in the viewer") from e
         center, size = np.array(values["center"], np.float64), np.array(values["size"], np.float64)
         rotation = np.array(values.get("rotation", np.eye(3)), np.float64)
     else:
         low, high = numbers_of(text.split(","), (6,), "--crop: a box (x,y,z,X,Y,Z, or a .json file)").reshape(2, 3)
         center, size, rotation = (low + high) / 2, high - low, np.eye(3)
-    if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > 1e-3:
+    if np.abs(geometry.matmul(rotation, rotation.T) - np.eye(3)).max() > 1e-3:
         raise UsageError(f"--crop {text[:60]}: rotation must be a rotation matrix: its columns perpendicular and of length 1")
     if not (size > 0).all():
         raise UsageError(f"--crop: the box has sides of {', '.join(f'{s:g}' for s in size)}; each must be longer than 0")
@@ -154,12 +152,7 @@ def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
 
 def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
     """Return whether each mean is in a box, bool [N]; box and Gaussians are in the same units."""
-    center, size, rotation = box
-    offsets = gaussians.means.double() - torch.tensor(center, dtype=torch.float64, device=gaussians.means.device)
-    out = torch.ones(len(gaussians), dtype=torch.bool, device=offsets.device)
-    for direction, side in zip(rotation.T, size):
-        out &= sum(float(d) * offsets[:, i] for i, d in enumerate(direction)).abs() <= float(side) / 2
-    return out
+    return torch.from_numpy(geometry.inside(gaussians.means.double().cpu().numpy(), box)).to(gaussians.means.device)
 
 
 def size_of(gaussians: Gaussians) -> float:
@@ -209,7 +202,7 @@ def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
         raise UsageError("--rotate: the axis has length 0, or a number is not finite")
     x, y, z = np.asarray(axis, np.float64) / length
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * matmul(cross, cross)
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * geometry.matmul(cross, cross)
 
 
 def levelling(up: np.ndarray) -> np.ndarray:

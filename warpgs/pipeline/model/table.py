@@ -1,7 +1,5 @@
 """The Gaussians of a fit with their statistics, and the model file that keeps them."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -14,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, expect, explained
 from warpgs.files import read_tensors, tensor_pieces, write_bytes
 from warpgs.geometry import check_stored, checked_normalization, convert_camera, convert_gaussians, logit
 from warpgs.kernels.neighbours import morton_codes
@@ -44,16 +42,15 @@ def truncated(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
 
 def pack(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     """Pack coefficients [N, K, 3] up to each Gaussian's degree [N], which ascend, into one vector [M]."""
-    if bool((degrees.diff() < 0).any()):
-        raise ValueError("degrees must ascend; sort the Gaussians by degree first")
+    expect((degrees.diff() >= 0).all(), "degrees must ascend; sort the Gaussians by degree first")
     return torch.cat([sh[degrees == d, : (d + 1) ** 2].reshape(-1) for d in range(MAX_DEGREE + 1)])
 
 
 def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     """Return coefficients [N, K, 3] from the vector [M] of `pack`: K for the highest degree, 0 above each Gaussian's degree."""
     whole = degrees.ndim == 1 and not degrees.is_floating_point() and bool(((degrees >= 0) & (degrees <= MAX_DEGREE)).all())
-    if packed.shape != (3 * int((degrees.long() + 1).square().sum()) if whole else -1,):
-        raise ValueError(f"coefficients {list(packed.shape)} do not fit degrees {list(degrees.shape)}, 0 to {MAX_DEGREE}")
+    fits = whole and packed.shape == (3 * int((degrees.long() + 1).square().sum()),)
+    expect(fits, f"coefficients {list(packed.shape)} do not fit degrees {list(degrees.shape)}, 0 to {MAX_DEGREE}")
     highest = int(degrees.max()) if len(degrees) else 0
     sh, at = packed.new_zeros(len(degrees), (highest + 1) ** 2, 3), 0
     for d in range(highest + 1):
@@ -140,7 +137,7 @@ class Table:
         return self.count
 
     @staticmethod
-    def of_gaussians(gaussians: Gaussians, columns: Mapping[str, Column]) -> Table:
+    def of_gaussians(gaussians: Gaussians, columns: Mapping[str, Column]) -> "Table":
         """Return the table of a set of Gaussians."""
         return Table(gaussians.tensors(), columns, gaussians.means.device, len(gaussians))
 
@@ -237,20 +234,18 @@ class Table:
 
     def _check(self, update: DensityUpdate, capacity: int | None) -> None:
         """Check the indices and values of a change, and the size of the set after it."""
-        for name, rows in {"keep": update.keep, "overwritten": update.overwritten, "parents": update.parents}.items():
-            if rows is None:
-                continue
-            if not isinstance(rows, torch.Tensor) or rows.dtype != torch.int64 or rows.ndim != 1:
-                raise UsageError(f"DensityUpdate.{name} must be an int64 tensor of one axis; give indices of rows")
-            low = -1 if name == "parents" else 0
-            if len(rows) and not low <= int(rows.min()) <= int(rows.max()) < self.count:
-                raise UsageError(f"DensityUpdate.{name} must be from {low} to {self.count - 1}, the rows before the change")
-            if name != "parents" and len(rows.unique()) < len(rows):
-                raise UsageError(f"DensityUpdate.{name} holds a row twice; give each row once, and copies through added")
-        for where, rows_of in (("added", update.added), ("values", update.values)):
-            for name, t in rows_of.items():
-                if bad := t.numel() - int(torch.isfinite(t).sum()):
-                    raise UsageError(f"DensityUpdate.{where}[{name!r}] has {bad:,} non-finite values; give finite ones")
+        rows_of = {"keep": (update.keep, 0), "overwritten": (update.overwritten, 0), "parents": (update.parents, -1)}
+        with explained("a DensityUpdate is impossible", "correct the strategy that gave it", ValueError, UsageError):
+            for name, (rows, low) in rows_of.items():
+                if rows is None:
+                    continue
+                indices = isinstance(rows, torch.Tensor) and rows.dtype == torch.int64 and rows.ndim == 1
+                expect(indices, f"{name} must be an int64 tensor of one axis, indices of rows")
+                there = not len(rows) or low <= int(rows.min()) <= int(rows.max()) < self.count
+                expect(there, f"{name} must be from {low} to {self.count - 1}, the rows before the change")
+                expect(low or len(rows.unique()) == len(rows), f"{name} holds a row twice; copies go through added")
+            for name, t in [*update.added.items(), *update.values.items()]:
+                expect(torch.isfinite(t).all(), f"the rows of {name} have non-finite values")
         after = len(update.keep) + len(update.parents)
         if capacity is not None and after > max(capacity, self.count):
             raise UsageError(
@@ -471,12 +466,11 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     tensors, header, _ = read_tensors(path, "check the path and its permissions", "write it again with warpgs.save")
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
-    try:
+    fix = "write it again with warpgs.save"
+    with explained(f"{path}: its header is damaged", fix, (KeyError, ValueError, UsageError)):
         units, names = header["units"], header.keys() - {"format", "version", "units"}
         SIMILARITY(similarity := {n: schema.parse(header[n]) for n in names}, "normalization")
         normalization = checked_normalization(similarity_of(similarity, str(path)), units, str(path))
-    except (KeyError, ValueError, UsageError) as e:
-        raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
     gaussians = checked_gaussians(tensors, str(path)).to(device)
     return Model(convert_gaussians(gaussians, normalization, units, "scene"), normalization)
 
@@ -487,10 +481,8 @@ def checked_gaussians(tensors: Tensors, where: str) -> Gaussians:
     if missing := [n for n in names if n not in tensors]:
         raise DataError(f"{where}: {', '.join(missing)} missing; restore the file, or write it again")
     gaussians = Gaussians(**{n: tensors[n] for n in names})
-    try:
+    with explained(f"{where}: damaged", "restore the file, or write it again", (TypeError, ValueError)):
         _check_values(gaussians, where)
-    except (TypeError, ValueError) as e:
-        raise DataError(f"{where}: {e}; restore the file, or write it again") from e
     return gaussians
 
 

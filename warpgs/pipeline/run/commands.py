@@ -14,7 +14,7 @@ import torch
 
 from warpgs.constants import LOW_PASS, rule_named
 from warpgs.device import format_bytes
-from warpgs.errors import DataError, UsageError, WarpgsError
+from warpgs.errors import DataError, UsageError, WarpgsError, expect, explained
 from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.export.ply import write_ply
 from warpgs.files import filling, write_bytes, write_json, writing_into
@@ -170,7 +170,7 @@ def render(
     tell = Stages()
     settings = replace(settings, background=color)
     plan = film.plan_film(stored, path, settings)
-    training: list[View] | bool = False
+    training: list[View] | bool = coverage
     alone, one_size = film.check_plan(plan, out, coverage, sheet)
     told = not alone and any(p.is_file() for p in (out / film.FILM, *home.glob(f"path-*/{film.FILM}")))
     if one_size and not told and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
@@ -179,7 +179,6 @@ def render(
         try:
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
         except WarpgsError as e:
-            training = True
             notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / film.COVERAGE}: {COVERAGE_LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
@@ -333,8 +332,6 @@ def clean(
             write_bytes(out, png(clean_picture(stored, found, train)))
         home = shlex.quote(str(folder))
         last.append(f"picture in {out}; `warpgs prune {home} --clean all`, or with some of these names, removes them")
-        box = f"save a crop box in `warpgs view {home}`, then `warpgs export {home} --to FILE --crop {home}/crop.json`"
-        last.append(f"if smears remain, cut them off: {box}")
     else:
         last = write_clean(stored, out, found, scores)
     return [
@@ -380,14 +377,11 @@ def plot(
     background: str = "white", size: tuple[int, int] = (1600, 1000), cameras: bool = True,
 ) -> list[str]:  # fmt: skip
     """Write a plot of a run as PNG, with the options of `warpgs plot`; returns lines for the user."""
-    if not all(SIZES[0] <= s <= SIZES[1] for s in size):
-        raise UsageError(f"--size {size[0]} {size[1]}: each side must have {SIZES[0]} to {SIZES[1]} px")
-    start, by_coverage = points == "start", color == "coverage"
-    if start and by_coverage:
-        raise UsageError("--color coverage needs Gaussians; leave out --points start")
-    out = folder / PLOT if out is None else out
-    if out.suffix.lower() != ".png":
-        raise UsageError(f"{out}: a plot is a .png file; give a name that ends in .png")
+    start, by_coverage, out = points == "start", color == "coverage", folder / PLOT if out is None else out
+    with explained(f"{out}: no such plot", "change this", ValueError, UsageError):
+        expect(all(SIZES[0] <= s <= SIZES[1] for s in size), f"each side of --size must have {SIZES[0]} to {SIZES[1]} px")
+        expect(not (start and by_coverage), "--color coverage needs Gaussians, not --points start")
+        expect(out.suffix.lower() == ".png", "a plot is a .png file")
     stored, tell = open_run(folder, device_name), waiting()
     found, gaussians = stored.cameras(), stored.gaussians()
     train, test = ([found[n] for n in names] for names in (stored.train, stored.test))

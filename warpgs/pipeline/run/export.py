@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs.device import format_bytes
-from warpgs.errors import DataError, UsageError, listed
+from warpgs.errors import DataError, UsageError, explained, listed
 from warpgs.export.base import Format, find_format, format_of, origin_of, write_gaussians
 from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
 from warpgs.geometry import convert_box, convert_camera, convert_gaussians, convert_points, matmul, rotate
@@ -84,11 +84,6 @@ def file_gaussians(stored: StoredRun) -> Gaussians:
     return convert_gaussians(edit.drop_unused_sh(stored.gaussians()), stored.normalization.local, "scene", "file")
 
 
-def _unit(stored: StoredRun | None) -> str:
-    """Return the name of the unit of a run's files, or of a file of no run."""
-    return "m" if stored is not None and stored.normalization.unit == "m" else "units of the scene's files"
-
-
 def origin_line(origin: np.ndarray) -> list[str]:
     """Return a line for the user on the origin [3] of a file, if it is not 0."""
     at = ", ".join(f"{v:.12g}" for v in origin)
@@ -125,10 +120,8 @@ def rotation_of(wish: str | None, up: np.ndarray | None) -> np.ndarray | None:
         if up is None:
             raise UsageError("--rotate level needs the cameras of a run that agree on an upward direction; give x,y,z,degrees")
         return edit.levelling(up)
-    try:
+    with explained(f"--rotate {wish[:60]}: not four numbers", "give x,y,z,degrees, or level", ValueError, UsageError):
         x, y, z, degrees = map(float, wish.split(","))
-    except ValueError as e:
-        raise UsageError(f"--rotate {wish[:60]}: give x,y,z,degrees, or level") from e
     return edit.rotation_about(np.array([x, y, z]), math.radians(degrees))
 
 
@@ -140,8 +133,6 @@ def turned_line(rotation: np.ndarray) -> str:
 
 MAX_POINTS = 100_000
 """Largest number of points that COLMAP's files get: as many as a reconstruction of some hundred photographs."""
-ROUNDING = 1e-4
-"""Smallest change of a log scale that is reported: a hundredth of a percent."""
 
 
 def convert(
@@ -210,14 +201,6 @@ def _written(
     kind.origin = origin
     with hold_file(target) as notes:
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
-    if type(kind).decode is not Format.decode:  # the rounding errors, measured on the file
-        back = kind.read_stored(target)
-        moved = float((back.means.double() - gaussians.means.double()).abs().max())
-        scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
-        other = int((scales > 0.1).sum())
-        if moved or not float(scales.max()) < ROUNDING:
-            more = f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else ""
-            lines.append(f"the format rounds positions, by at most {moved:.2g} {_unit(stored)}{more}")
     lines += ([kind.note] if kind.note else []) + origin_line(origin)
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(kind.size(target))}"]
 
@@ -273,7 +256,7 @@ def mesh(
         options = replace(options, crop=box)
 
     def planned(plan: GridPlan, memory: str) -> None:
-        size = f"{' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {_unit(run)}"
+        size = f"{' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} {run.normalization.unit}"
         lost = f"; {1 - plan.inside:.1%} of the observed surface is outside the grid and left out"
         say(f"grid: {size}{lost * (plan.inside < 0.9995)}")
 
@@ -291,7 +274,5 @@ def mesh(
     ]
     if found.uncolored:
         lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")
-    if up is None and target.suffix.lower() == ".glb":
-        notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
     lines += origin_line(run.normalization.origin)
     return [*run.notes(), *notes, *lines, f"{target}: {format_bytes(target.stat().st_size)}"]

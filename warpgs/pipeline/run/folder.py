@@ -18,8 +18,8 @@ import torch
 
 from warpgs import schema
 from warpgs.constants import RULES
-from warpgs.errors import DataError, NotFiniteError, UsageError, similar_folder
-from warpgs.files import is_empty, open_input, plain, tensor_pieces, tensors_of, unread_reason, write_bytes
+from warpgs.errors import DataError, NotFiniteError, UsageError, expect, explained, similar_folder
+from warpgs.files import is_empty, open_input, plain, tensor_pieces, tensors_of, write_bytes
 from warpgs.io.load import Split
 from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
@@ -44,8 +44,8 @@ def _view_name(value: Any, place: str) -> None:
     """Allow names of views: relative paths of files."""
     text(value, place)
     path = PurePosixPath(value)
-    if path.is_absolute() or path.name in ("", "..") or ".." in path.parts:
-        raise SchemaError(f"{place} must be the relative path of an image, not {value[:60]!r}")
+    sound = not path.is_absolute() and path.name not in ("", "..") and ".." not in path.parts
+    expect(sound, f"{place} must be the relative path of an image, not {value[:60]!r}")
 
 
 _MATRICES = {name: items(items(number(), size), size) for name, size in (("viewmat", 4), ("K", 3))}
@@ -121,23 +121,18 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
 def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Read tensors by name, on the CPU, and state; refuse a damaged checkpoint or one of another format."""
     path = folder / TENSORS
-    try:
+    if not os.path.lexists(path):
+        raise DataError(f"{folder} holds no {TENSORS}: no checkpoint yet; run `warpgs fit` first")
+    with explained(f"{path}: not a whole checkpoint", RESTORE, (OSError, KeyError, ValueError)):
         with open_input(path, folder) as file:
             body = file.read(max(0, os.fstat(file.fileno()).st_size - 32))
             digest = file.read(33)
-        if hashlib.sha256(body).digest() != digest:
-            raise ValueError("the checksum does not match: the file was truncated or altered")
+        expect(hashlib.sha256(body).digest() == digest, "the checksum does not match: the file was truncated or altered")
         tensors, metadata = tensors_of(body)
         if metadata.get("format") != str(FORMAT):
             raise DataError(_other_version(f"{path}: warpgs {metadata.get('version', '0.1.0')} wrote this checkpoint"))
         state = schema.parse(metadata["state"])
         schema.mapping(schema.anything)(state, "")
-    except FileNotFoundError as e:
-        raise DataError(f"{folder} holds no {TENSORS}: no checkpoint yet; run `warpgs fit` first") from e
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {RESTORE}") from e
-    except (KeyError, ValueError) as e:
-        raise DataError(f"{path}: not a whole checkpoint ({e}); {RESTORE}") from e
     return tensors, state
 
 
@@ -189,7 +184,7 @@ def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
 
 def _check_folder(out: Path, resume: bool) -> None:
     """Raise a UsageError if a folder has no run to continue, or must be new but is not."""
-    try:
+    with explained(f"{out}: cannot be read", "choose another --out", kind=UsageError):
         if not (out / CONFIG).exists() and (out / POSED_SCENE / POSES).is_file():
             return
         if resume and not (out / CONFIG).is_file():
@@ -197,8 +192,6 @@ def _check_folder(out: Path, resume: bool) -> None:
         if not resume and out.exists() and not (out.is_dir() and is_empty(out)):
             check_free(out)
             raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
-    except OSError as e:
-        raise UsageError(f"{out}: cannot be read ({e.strerror or e}); choose another --out") from e
 
 
 def camera_values(camera: Camera) -> dict[str, Any]:
@@ -213,15 +206,13 @@ def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
     for name, values in stored.items():
         arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
         camera = found[name] = Camera(**(values | arrays))
-        try:
+        with explained(f"{path}: incomplete or damaged: cameras.{name[:60]}", RESTORE, (UsageError, ValueError)):
             check_camera(camera)
             check_arrays(camera)
-            if np.abs(camera.viewmat[:3, 3]).max() > MAX_TRANSLATION:
-                raise UsageError(f"viewmat must have a translation within {MAX_TRANSLATION:g}")
-            if not all(least <= abs(f) <= most for f in (camera.K[0, 0], camera.K[1, 1])):
-                raise UsageError(f"K must have focal lengths of {least:g} to {most:g}")
-        except (UsageError, ValueError) as e:
-            raise DataError(f"{path}: incomplete or damaged: cameras.{name[:60]}: {e}; {RESTORE}") from e
+            within = np.abs(camera.viewmat[:3, 3]).max() <= MAX_TRANSLATION
+            expect(within, f"viewmat must have a translation within {MAX_TRANSLATION:g}")
+            focal = all(least <= abs(f) <= most for f in (camera.K[0, 0], camera.K[1, 1]))
+            expect(focal, f"K must have focal lengths of {least:g} to {most:g}")
     return found
 
 
@@ -245,29 +236,22 @@ def record_of(
 def read_record(folder: Path) -> dict[str, Any]:
     """Read config.json of a run folder; its format is checked first."""
     path = folder / CONFIG
-    try:
-        record = schema.read(path, folder)
-    except (FileNotFoundError, NotADirectoryError) as e:
+    fix = "give a folder that `warpgs fit --out` filled"
+    if not os.path.lexists(path):
         lack = f"not the folder of a run ({CONFIG} is missing)" if folder.exists() else "no such folder"
-        near = similar_folder(folder) if not folder.exists() else ""
-        raise DataError(f"{folder}: {lack}; {near or 'give a folder that `warpgs fit --out` filled'}") from e
-    except (OSError, SchemaError) as e:
-        raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
-    if not isinstance(record, dict) or "config" not in record:
-        raise DataError(f"{path}: not a record of a fit; give a folder that `warpgs fit --out` wrote")
+        raise DataError(f"{folder}: {lack}; {(not folder.exists() and similar_folder(folder)) or fix}")
+    with explained(f"{path}: not a record of a fit", fix, (OSError, ValueError)):
+        record: dict[str, Any] = schema.read(path, folder)
+        expect(isinstance(record, dict) and "config" in record, "it has no settings")
     if record.get("format") != FORMAT:  # version 0.1.0 stored no number
         stored = record.get("versions")
         version = stored.get("warpgs", "unknown") if isinstance(stored, dict) else "unknown"
         raise DataError(_other_version(f"{path}: warpgs {version} wrote this run"))
-    try:
+    with explained(f"{path}: incomplete or damaged", RESTORE, ValueError):
         _RECORD(record, "")
-        if not record["train"]:
-            raise SchemaError("train must name a view")
+        expect(record["train"], "train must name a view")
         for name in [*record["train"], *record["test"]]:
-            if name not in record["cameras"]:
-                raise SchemaError(f"cameras lacks the view {name[:60]!r}")
-    except SchemaError as e:
-        raise DataError(f"{path}: incomplete or damaged: {e}; {RESTORE}") from e
+            expect(name in record["cameras"], f"cameras lacks the view {name[:60]!r}")
     stored, (record["config"], lost) = record["config"], upgraded(record["config"])
     if lost:
         record["lost"] = lost
@@ -397,11 +381,9 @@ def stored_request(folder: Path, moved: str | None = None) -> FitRequest:
         scene = _stored_scene(folder, record, None, moved)
     except UsageError as e:
         raise UsageError(f"{e}, with the scene and all other flags of the run") from e
-    try:
+    fix = f"{RESTORE}; a name of your own code needs the whole command of the fit, with --resume"
+    with explained(f"{folder / CONFIG}: invalid settings", fix, (UsageError, SchemaError)):
         config = FitConfig.from_json(record["config"])
-    except (UsageError, SchemaError) as e:
-        fix = f"{RESTORE}; a name of your own code needs the whole command of the fit, with --resume"
-        raise DataError(f"{folder / CONFIG}: invalid settings ({e}); {fix}") from e
     return FitRequest(scene, folder, config, record["device"], resume=True)
 
 
@@ -422,12 +404,10 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     record = read_record(folder)
     tensors, state = load_checkpoint(folder)
     found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
-    try:
+    with explained(f"{path}: incomplete or damaged", RESTORE, ValueError):
         MODEL_STATE(state, "")
         if "sh_packed" in found and "degrees" in tensors:
             found["sh"] = unpack(found.pop("sh_packed"), tensors["degrees"])
-    except ValueError as e:
-        raise DataError(f"{path}: incomplete or damaged: {e}; {RESTORE}") from e
     gaussians = checked_gaussians(found, str(path)).to(where)
     red, green, blue = map(float, record["background"])
     return StoredRun(

@@ -1,7 +1,5 @@
 """Requests for a fit, with their scene and device."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -38,7 +36,7 @@ class SceneRequest(SceneOptions):
     matcher: str | None = None
     """ONNX file of `warpgs priors export --model xfeat`, used if SIFT leaves photographs without a pose; None: SIFT only."""
 
-    def with_scale(self, device: str) -> SceneRequest:
+    def with_scale(self, device: str) -> "SceneRequest":
         """Return this request with default image sizes resolved for ``device``, cpu or cuda, to store it with a run."""
         side = CPU_MAX_SIDE if device == "cpu" and self.max_side is None and self.downscale is None else self.max_side
         downscale, max_side = image_scale(self.downscale, side)
@@ -96,8 +94,6 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     """Split a scene by ``spec`` (None: all views train); returns the split and notes on doubtful scores."""
     split = split_views(scene, "all" if spec is None else spec)
     notes = [] if split.test else [NO_SCORES]
-    if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
-        notes.append("masks hide pixels from the fit, unlike in the published DTU protocol; score with --score-masks instead")
     for test, train in coincident_views(scene, split):
         notes.append(f"{test} is held out, but training view {train} has the same pose, so this score does not test new views")
     return split, notes

@@ -204,7 +204,7 @@ def view_sheet(
         f"{len(at):,} pixels sampled of the {gate.sum():,} that pass the gate, {gate.mean():.0%} of the view.",
         f"Gate: {_open_pixels(strategy, view.consistent is not None, sampled.quantile)}.",
     ]
-    return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
+    return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320)
 
 
 def _on_host(sampled: SampledView) -> SampledView:

@@ -1,7 +1,5 @@
 """The loss: the interface of a term, and the built-in terms."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -47,7 +45,7 @@ class Target:
 class _Outputs(dict[str, Tensor]):
     """Images of a render that a term requested; reading another one raises an error."""
 
-    def __init__(self, term: LossTerm, images: Tensors):
+    def __init__(self, term: "LossTerm", images: Tensors):
         super().__init__({n: images[n] for n in term.needs_outputs})
         self.term = term
 

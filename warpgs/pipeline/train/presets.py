@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import UsageError, expect, explained
 from warpgs.files import is_within, read_file
 from warpgs.plugins import load_object, module_digest, module_of
 from warpgs.process import Detail
@@ -149,13 +149,11 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
     """Return the values of a TOML file, and the first digits of its SHA-256."""
     remedy = "give a file of settings such as `steps = 300` (docs/presets.md)"
     data = read_file(path, most=MAX_BYTES, fix=remedy)
-    try:
-        if any(line.count(b".") > MAX_DOTS for line in data.split(b"\n")):
-            raise ValueError(f"more than {MAX_DOTS} dots in a line")
+    what = f"{path}: not valid TOML of at most {MAX_DEPTH} nested tables and lists"
+    with explained(what, remedy, (ValueError, RecursionError)):  # no TOML, no UTF-8, or too deep
+        expect(all(line.count(b".") <= MAX_DOTS for line in data.split(b"\n")), f"more than {MAX_DOTS} dots in a line")
         values = tomllib.loads(data.decode("utf-8"))
         check_depth(values, MAX_DEPTH)
-    except (ValueError, RecursionError) as e:  # no TOML, no UTF-8, or too deep
-        raise DataError(f"{path}: not valid TOML of at most {MAX_DEPTH} nested tables and lists ({e}); {remedy}") from e
     return values, hashlib.sha256(data).hexdigest()[:12]
 
 

@@ -1,7 +1,5 @@
 """What a step number decides: rates, events, backgrounds; and the report of a step."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence
@@ -139,7 +137,7 @@ class Phases:
         begun = (self.stable_start - 1) / planned
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
-    def stable_from(self, step: int, planned_start: int) -> Phases:
+    def stable_from(self, step: int, planned_start: int) -> "Phases":
         """Return the phases for a third phase that begins after ``step``, not as planned, and is shortened in proportion."""
         length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
@@ -216,7 +214,8 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
             color, why = scene.background, "that of the scene's files, since views show a cut-out object"
         else:
             return scene.background, ""
-    return color, f"background: {why}, {_words(color)}; change it with --background"
+    code = "".join(f"{round(255 * c):02x}" for c in color)
+    return color, f"background: {why}, #{code}; change it with --background"
 
 
 def over_background(scene: Scene, color: Color) -> Scene:
@@ -240,11 +239,6 @@ def random_shift(seed: int, step: int, background: Sequence[float]) -> tuple[flo
     """Return a random colour, uniform in [0, 1], minus the scene's background [3]; it depends on seed and step only."""
     red, green, blue = (b - a for a, b in zip(background, np.random.default_rng([seed, step, BEHIND]).random(3).tolist()))
     return red, green, blue
-
-
-def _words(color: Color) -> str:
-    """Return a colour as text, #rrggbb."""
-    return "#" + "".join(f"{round(255 * c):02x}" for c in color)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Training views: their tensors on the device, the order in which steps take them, and what is learned of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -135,7 +133,7 @@ class TrainingView:
     """Values of the view in the view modules of the fit; None without view modules."""
 
     @staticmethod
-    def of(view: View, device: torch.device) -> TrainingView:
+    def of(view: View, device: torch.device) -> "TrainingView":
         """Return a view's pixels, mask, opacity and camera in float32 on a device."""
         c = view.camera
         lens = c.distortion if c.distortion is not None and len(c.distortion) else None
@@ -200,7 +198,7 @@ def half_size_camera(c: Camera) -> Camera:
     return replace(c, K=scale[:, None] * c.K, width=width, height=height)
 
 
-def half_size(view: TrainingView) -> TrainingView:
+def half_size(view: TrainingView) -> "TrainingView":
     """Return the view with both sides halved, rounded down but to at least one pixel; without scores.
 
     Colours, opacities and maps are means over the covered pixels; a pixel is masked if any covered pixel is masked.
