@@ -149,12 +149,12 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
 def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
     """Return a pose [4, 4] with its rotation made exactly orthonormal."""
     R = viewmat[:3, :3]
-    with explained(f"{where}: impossible", "estimate the pose again, or remove the image", ValueError):
+    with explained(f"{where}: cannot be used", "estimate the pose again, or remove the image", ValueError):
         expect(viewmat.shape == (4, 4) and np.isfinite(viewmat).all(), "the pose is not finite")
         # entries of a rotation are at most 1; the bound keeps the squares of wild ones from overflowing
         error = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 1e3 else np.inf
-        expect(error <= POSE_TOLERANCE, f"the pose is not rigid (R R^T is off by {error:.2g})")
-        expect(np.linalg.det(R) > 0, "the pose mirrors the scene (determinant -1)")
+        expect(error <= POSE_TOLERANCE, f"the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears")
+        expect(np.linalg.det(R) > 0, "the pose mirrors the scene (determinant -1): two axes are probably swapped")
     return pose_of(nearest_rotation(R), viewmat[:3, 3])
 
 

@@ -154,7 +154,7 @@ class Lens:
         """
         f, c = self.K[[0, 1], [0, 1]], self.K[:2, 2]
         size, terms = np.array([self.width, self.height]), self.distortion
-        with explained(f"{where}: impossible", "calibrate again, or fix the file", ValueError):
+        with explained(f"{where}: impossible camera", "calibrate again, or fix the file", ValueError):
             expect(((size >= 1) & (size <= MAX_INTRINSIC)).all(), f"the camera's image size {self.width} x {self.height} px")
             expect(((f >= MIN_FOCAL * size) & (f < MAX_INTRINSIC)).all(), f"focal lengths {f.tolist()} px")
             expect((np.abs(c) < MAX_INTRINSIC).all(), f"the principal point {c.tolist()} px is not finite or too large")

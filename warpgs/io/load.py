@@ -496,6 +496,9 @@ def doubtful_notes(views: list[View], points: PointCloud | None) -> list[str]:
             distance = float(np.median(np.linalg.norm(points.points - middle, axis=1)))
     if spread < max(MIN_EXTENT, MIN_BASELINE * min(distance, MAX_COORDINATE)):
         notes.append(f"all cameras are within {spread:.2g} units of one place, without depth: move between photographs")
+    off = [v for v in views if not all(0 <= v.camera.K[i, 2] <= n for i, n in ((0, v.camera.width), (1, v.camera.height)))]
+    if off:
+        notes.append(f"principal points of {len(off)} views, as of {off[0].name}, are outside the image; calibrate again")
     # most photographs differ, and vary, in a few pixels already
     equal: dict[bytes, list[str]] = {}
     few = [v.image[::SPARSE, ::SPARSE] for v in views]

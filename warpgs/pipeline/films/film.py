@@ -12,7 +12,7 @@ import torch
 from warpgs.device import background
 from warpgs.errors import UsageError, did_you_mean, expect, explained, listed
 from warpgs.files import make_folder, write_bytes
-from warpgs.geometry import convert_camera
+from warpgs.geometry import convert_camera, pinhole_of
 from warpgs.locks import hold_file, hold_folder
 from warpgs.mesh.views import MIN_ALPHA
 from warpgs.pipeline.films import paths
@@ -84,6 +84,8 @@ VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 MIN_FRAMES_PER_VIEW = 4
 """Fewest frames from one training view to the next; a film with too few frames skips some of the views."""
 MAX_FRAMES = 1_000_000
+WIDER = 1.02
+"""A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
 AT_VIEWS = "score each view with `warpgs eval`; --coverage marks these places"
 """Advice for frames at training views."""
 
@@ -187,26 +189,42 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
             raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
         shown = [(names[n], paths.framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
-        return FilmPlan(shown, coverage, AT_VIEWS, [])
+        return FilmPlan(shown, coverage, AT_VIEWS, _cropped(train[0], settings))
     rig = paths.rig_of(train, depth, model.normalization.up)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
         remedy = "move the keyframes nearer to the photographs; c2w is in OpenCV axes, in the units of the scene's files"
         return FilmPlan(_numbered(cameras), coverage, remedy, [words])
     notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
+    if rig.turned:
+        notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
     kind = paths.path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         far = [c for c in train if not 0 < rig.reach(c) < paths.CLOSE * rig.distance]
         left_out = len(train) - len(far) if path == "auto" and len(far) > 1 else 0
         cameras, words = _tour(rig, far if left_out else train, settings)
         words += f"; {left_out} close-ups are left out" * bool(left_out)
+        words += "; --path turntable is calmer" * (path == "auto" and rig.kind == "forward")
         remedy = AT_VIEWS
     else:
         cameras = paths.camera_path(kind, rig, train, settings.count(SECONDS))
         words = f"path: {kind}" + ", there and back over the captured area" * (rig.span is not None and kind == "turntable")
         remedy = "--path interpolate stays at the training views"
+    notes += _cropped(cameras[0], settings)
     cameras = [paths.framed(c, settings.size, settings.fov_y) for c in cameras]
     return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words])
+
+
+def _cropped(camera: Camera, settings: FilmSettings) -> list[str]:
+    """Return a line for the user on what frames of another shape do not show of a photograph."""
+    if settings.size is None or settings.fov_y is not None:
+        return []
+    camera = pinhole_of(camera)
+    zooms = settings.size[0] / camera.width, settings.size[1] / camera.height
+    whole = math.degrees(2 * math.atan(0.5 * settings.size[1] / (min(zooms) * camera.K[1, 1])))
+    shown = f"{min(zooms) / max(zooms):.0%} of their {'height' if zooms[0] > zooms[1] else 'width'}"
+    words = f"frames have another shape than the photographs, and show {shown}; --fov {whole:.0f} shows all"
+    return [words] * (max(zooms) > WIDER * min(zooms))
 
 
 def _numbered(cameras: list[Camera]) -> list[tuple[str, Camera]]:

@@ -141,7 +141,9 @@ def box_of(text: str) -> Box:
     if np.abs(geometry.matmul(rotation, rotation.T) - np.eye(3)).max() > 1e-3:
         raise UsageError(f"--crop {text[:60]}: rotation must be a rotation matrix: its columns perpendicular and of length 1")
     if not (size > 0).all():
-        raise UsageError(f"--crop: the box has sides of {', '.join(f'{s:g}' for s in size)}; each must be longer than 0")
+        raise UsageError(
+            f"--crop {text[:60]}: the box has sides of {', '.join(f'{s:g}' for s in size)}; each must be longer than 0"
+        )
     return center, size, rotation
 
 
