@@ -303,7 +303,7 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
             for n in (np.nan, np.inf, -np.inf)
         ),
         ({"transform_matrix": [[np.nan] * 4] * 4}, r"frame 1 .*: .*the pose is not finite"),
-        ({"w": 0}, r"frame 1 .*: impossible .the camera's image size 0 x 12 px"),
+        ({"w": 0}, r"frame 1 .*: impossible camera .the camera's image size 0 x 12 px"),
         ({"w": 30}, r"photo1.png: the image is 16 x 12 px, its camera 30 x 12"),
         ({"k4": 0.1}, r"frame 1 .*: k4 is not supported"),
         ({"k4": 0.1, "camera_model": "FULL_OPENCV"}, r"frame 1 .*: k4 is not supported"),

@@ -99,9 +99,16 @@ def test_what_was_chosen_is_said(model, monkeypatch):
     plan = plan_film(model, "turntable", FilmSettings(seconds=0.5, fps=12, size=(64, 20), fov_y=0.5))
     assert [(c.width, c.height) for _, c in plan.cameras] == [(64, 20)] * 6 and "there and back" in plan.notes[-1]
     assert 2 * math.atan(10 / plan.cameras[0][1].K[1, 1]) == pytest.approx(0.5)
+    for size, lost, fov in (((160, 64), "height", "34"), ((80, 128), "width", "63"), ((80, 64), "", "")):
+        notes = [n for n in plan_film(model, "spiral", FilmSettings(frames=2, size=size)).notes if "shape" in n]
+        said = f"frames have another shape than the photographs, and show 50% of their {lost}; --fov {fov} shows all"
+        assert notes == [said] * bool(lost)
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
     assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 cameras in the given order")
     assert [n for n, _ in plan_film(model, "views", FilmSettings()).cameras] == [f"{i}" for i in range(5)]
+    monkeypatch.setattr("warpgs.pipeline.films.paths.path_of", lambda rig: "interpolate")
+    named = [plan_film(model, path, FilmSettings()).notes[-1].endswith("is calmer") for path in ("auto", "interpolate")]
+    assert named == [True, False]
     with pytest.raises(UsageError, match="path 'orbit'; choose one of auto, views, turntable, spiral, interpolate, or give"):
         plan_film(model, "orbit", FilmSettings())
     with pytest.raises(UsageError, match=r"unknown path 'turntabel'; did you mean turntable\?"):

@@ -613,6 +613,7 @@ def test_a_clean_up_is_shown_before(run, tmp_path, capsys):
         "in colour in the middle"
     )
     assert off[off.shape[0] // 2 :, third : 2 * third].min() > 70, "and above alone; below, the model from beside"
+    assert "if smears remain, cut them off: save a crop box in `warpgs view " in shown
     assert main([*words, "unseen,opacity", "--out", str(tmp_path / "clean")]) == 0
     said = capsys.readouterr().out
     assert "training PSNR" in said and f"{run} keeps the model before" in said

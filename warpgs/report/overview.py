@@ -132,7 +132,10 @@ def with_legend(image: np.ndarray, entries: list[tuple[str, str]], height: int, 
     rows, width = image.shape[:2]
     canvas, strip = Image.new("RGB", (width, height), background), height - rows
     draw, side, gap = ImageDraw.Draw(canvas), 0.32 * strip, 0.5 * strip
-    font = ImageFont.load_default(max(0.3 * strip, 6))
+    for letters in (0.42 * strip, 0.3 * strip, 0.22 * strip):
+        font = ImageFont.load_default(max(letters, 6))
+        if sum(side + 2 * gap + font.getlength(words) for words, _ in entries) <= width:
+            break
     x, y = gap, height - 0.55 * strip
     for words, color in entries:
         draw.rectangle((x, y - side / 2, x + side, y + side / 2), color)

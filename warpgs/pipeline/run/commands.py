@@ -332,6 +332,8 @@ def clean(
             write_bytes(out, png(clean_picture(stored, found, train)))
         home = shlex.quote(str(folder))
         last.append(f"picture in {out}; `warpgs prune {home} --clean all`, or with some of these names, removes them")
+        box = f"save a crop box in `warpgs view {home}`, then `warpgs export {home} --to FILE --crop {home}/crop.json`"
+        last.append(f"if smears remain, cut them off: {box}")
     else:
         last = write_clean(stored, out, found, scores)
     return [
@@ -378,7 +380,7 @@ def plot(
 ) -> list[str]:  # fmt: skip
     """Write a plot of a run as PNG, with the options of `warpgs plot`; returns lines for the user."""
     start, by_coverage, out = points == "start", color == "coverage", folder / PLOT if out is None else out
-    with explained(f"{out}: no such plot", "change this", ValueError, UsageError):
+    with explained(f"{out}: cannot be plotted", "change that flag", ValueError, UsageError):
         expect(all(SIZES[0] <= s <= SIZES[1] for s in size), f"each side of --size must have {SIZES[0]} to {SIZES[1]} px")
         expect(not (start and by_coverage), "--color coverage needs Gaussians, not --points start")
         expect(out.suffix.lower() == ".png", "a plot is a .png file")

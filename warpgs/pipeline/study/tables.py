@@ -219,7 +219,7 @@ def latex(table: Table) -> str:
     return "\n".join([*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table}"]) + "\n"
 
 
-INK, SOFT, RULE = "#1b1d21", "#666c76", "#d9dce1"
+INK, SOFT, RULE, BAND = "#1b1d21", "#666c76", "#d9dce1", "#f6f6f3"
 BETTER, WORSE, UNDECIDED = "#0b6e6e", "#c2570c", "#7a808a"
 """Colours of an interval on the better side of 0, on the worse side, and across 0: distinct for any colour vision."""
 ROW, PANEL, VALUES, GAP, MARGIN = 38, 230, 184, 24, 24
@@ -272,7 +272,10 @@ def forest(table: Table) -> str:
         _text(MARGIN, 34, table.caption, 17, weight=600),
     ]
     for i, name in enumerate(names):
-        out.append(_text(MARGIN, TOP + ROW * (i + 0.5) + 4, name, 13, weight=600 if name == base else 400))
+        y = TOP + ROW * i
+        if i % 2 == 0:
+            out.append(f'<rect x="{MARGIN - 8}" y="{y}" width="{width - 2 * MARGIN + 16:.0f}" height="{ROW}" fill="{BAND}"/>')
+        out.append(_text(MARGIN, y + ROW / 2 + 4, name, 13, weight=600 if name == base else 400))
     for k, (metric, differences) in enumerate(panels.items()):
         label, upwards, digits = METRICS[metric]
         values = [abs(v) for d in differences for v in (*d.values, d.low, d.high) if math.isfinite(v)]
@@ -293,8 +296,10 @@ def forest(table: Table) -> str:
             out += _line(table, name, metric, TOP + ROW * (i + 0.5) - 3, x0, px)
     if not panels:
         out.append(_text(MARGIN, 66, "no pair of runs to compare", 13, color=SOFT))
-    words = (
-        f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds; teal: better, orange: "
-    )
-    out.append(_text(MARGIN, height - 18, f"{words}worse, gray: undecided, the interval contains 0", 11, color=SOFT))
+    words = f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds"
+    out.append(_text(MARGIN, height - 18, words, 11, color=SOFT))
+    x = MARGIN + 6.0 * len(words) + 8
+    for color, meaning in ((BETTER, "better"), (WORSE, "worse"), (UNDECIDED, "undecided: the interval contains 0")):
+        out += [_dot(x, height - 22, 4.5, color), _text(x + 9, height - 18, meaning, 11, color=SOFT)]
+        x += 6.0 * len(meaning) + 28
     return "\n".join([*out, "</svg>"]) + "\n"
