@@ -204,8 +204,8 @@ def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
     assert b"TEXCOORD_0" in (tmp_path / "a.glb").read_bytes()
 
 
-def test_upright_where_the_cameras_agree(stored, tmp_path):
-    """A .glb file turns their mean upward direction to +y; cameras that are turned all ways have none."""
+def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
+    """A .glb file turns their mean upward direction to +y; cameras that are turned all ways have none, which is said."""
     views = [c for c, d in zip(cameras(ALL_SIDES), ALL_SIDES) if abs(d[1]) < 0.9]
     assert common_up(views) @ [0, -1, 0] > 0.7
     half = np.diag([-1.0, -1, 1, 1])
@@ -215,6 +215,7 @@ def test_upright_where_the_cameras_agree(stored, tmp_path):
             c = stored.scene_cameras[name]
             stored.scene_cameras[name] = dataclasses.replace(c, viewmat=half @ c.viewmat)
         assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
+        assert ("may be tilted in a viewer" in capsys.readouterr().out) == upside_down
 
 
 def test_the_front_faces_the_viewer_where_coordinates_are_made_up(stored, tmp_path):

@@ -190,7 +190,7 @@ def test_renders_films_and_exports_agree_in_new_coordinates(made, tmp_path, caps
     assert main(["export", str(run.folder), "--to", str(tmp_path / "cameras.json"), "--rotate", "level"]) == 0
     said = capsys.readouterr().out
     assert "rotated by 0.0 degrees" in said  # they are level already
-    assert "replaces" not in said
+    assert re.search("rounds positions, by at most [0-9.e-]+ m$", said, re.M) and "replaces" not in said
     key = {"c2w": np.linalg.inv(moved.viewmat).tolist(), "fov_y": 0.8, "seconds": 0}
     (tmp_path / "path.json").write_text(json.dumps([key]))
     np.testing.assert_allclose(read_keyframes(tmp_path / "path.json", camera, n)[0].camera.viewmat, camera.viewmat, atol=1e-9)

@@ -19,8 +19,6 @@ from warpgs.schema import Within, rules_of
 
 REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
 """What replaces flags that are gone, by their names with dashes."""
-SPELLED = {"--size": "1080 1920"}
-"""Examples of flags that take several values."""
 Threads = Annotated[int, Within(0, 4096)]
 """Number of threads."""
 Port = Annotated[int, Within(0, 65535)]
@@ -90,8 +88,8 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
             raise UsageError(note)
         if flag not in known and flag not in said.replace("_", "-"):  # tyro took the word after it for its value
             raise UsageError(f"unknown flag {flag}; `{program} --help-all` lists the flags")
-        if flag in SPELLED and re.search(f"(parsing|argument) '?{flag}", said):
-            raise UsageError(f"{flag}: write it as {flag} {SPELLED[flag]}; `{program} --help-all` shows what it takes")
+        if flag == "--size" and re.search("(parsing|argument) '?--size", said):
+            raise UsageError(f"--size: write it as --size 1080 1920; `{program} --help-all` shows what it takes")
     say_lines(said.splitlines(), error=True)
     raise UsageError(f"wrong arguments, as shown above; `{program} --help-all` lists them")
 

@@ -196,8 +196,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         remedy = "move the keyframes nearer to the photographs; c2w is in OpenCV axes, in the units of the scene's files"
         return FilmPlan(_numbered(cameras), coverage, remedy, [words])
     notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
-    if rig.turned:
-        notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
+    notes += ["the photographs are rotated; the film takes its upward direction from the plane of the cameras"] * rig.turned
     kind = paths.path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         far = [c for c in train if not 0 < rig.reach(c) < paths.CLOSE * rig.distance]

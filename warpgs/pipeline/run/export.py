@@ -188,8 +188,7 @@ def _written(
     if kind.max_degree < gaussians.sh_degree:
         lines.append(f"harmonics above degree {kind.max_degree} are dropped, because {kind.suffix} files cannot store them")
         gaussians = edit.limit_degree(gaussians, kind.max_degree)
-    if stored is not None:
-        lines = [*stored.notes(), *lines]
+    lines = [*(stored.notes() if stored is not None else []), *lines]
     if stored is not None and any(stored.background):
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
         lines.append(f"the file does not store the background colour of the fit, #{color}; set it in your viewer")
@@ -201,6 +200,13 @@ def _written(
     kind.origin = origin
     with hold_file(target) as notes:
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
+    if type(kind).decode is not Format.decode:  # the rounding errors, measured on the file
+        back, unit = kind.read_stored(target), "units" if stored is None else stored.normalization.unit
+        moved = float((back.means.double() - gaussians.means.double()).abs().max())
+        other = int(((back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1) > 0.1).sum())
+        if moved or other:
+            more = f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else ""
+            lines.append(f"the format rounds positions, by at most {moved:.2g} {unit}{more}")
     lines += ([kind.note] if kind.note else []) + origin_line(origin)
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(kind.size(target))}"]
 
@@ -274,5 +280,7 @@ def mesh(
     ]
     if found.uncolored:
         lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")
+    if up is None and target.suffix.lower() == ".glb":
+        notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
     lines += origin_line(run.normalization.origin)
     return [*run.notes(), *notes, *lines, f"{target}: {format_bytes(target.stat().st_size)}"]
