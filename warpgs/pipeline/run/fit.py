@@ -36,7 +36,7 @@ from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.memory import plan_summary
 from warpgs.pipeline.train.presets import chosen_settings
 from warpgs.pipeline.train.schedule import StepReport, choose_background, over_background
-from warpgs.pipeline.train.settings import FitConfig, settings_by_views, step_times, steps_by_views, within_budget
+from warpgs.pipeline.train.settings import WHOLE_FIT, FitConfig, settings_by_views, step_times, steps_by_views, within_budget
 from warpgs.pipeline.train.step import StepBuffers, eager_renderer
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity_figures, complexity_summary, run, train_views
@@ -191,7 +191,7 @@ def planned_times(job: FitJob, trainer: Trainer) -> tuple[Sequence[float] | None
     config = replace(config, max_gaussians=min(config.max_gaussians, trainer.context.capacity))
     times, counts = step_times(config, len(job.train), pixels, trainer.first_count, growing=True)
     left, last = times[trainer.step : trainer.steps], counts[trainer.steps - 1]
-    took = f"{len(left):,} steps take about {duration(left.sum())} on two idle cores, besides start and report"
+    took = f"{len(left):,} steps take about {duration(WHOLE_FIT * left.sum())} on two idle cores, besides start and report"
     return times.tolist(), [f"{took}; they end with about {float(f'{last:.2g}'):,.0f} Gaussians"] * (len(left) > 0)
 
 

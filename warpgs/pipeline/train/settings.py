@@ -530,6 +530,9 @@ that shows which Gaussians to remove."""
 GROWN, SATURATED = 25.0, 0.2
 """Gaussians that growth by gradients adds in a step, and their largest number for each pixel of all views while it adds to them
 (docs/decisions/025-time-on-a-cpu.md). The printed time allows for them."""
+WHOLE_FIT = 1.15
+"""Printed time of all steps over the sum of `step_times`: ten captures took 0.98 to 1.37 times the sum
+(docs/decisions/025-time-on-a-cpu.md)."""
 FIRST_POINTS, FIRST_POWER, SWEPT_VIEWS = 2.4, 0.64, 30
 """Number of first points over that of the merged cells of one view, for one view; exponent of its growth with the number of
 views; and number of views above which it does not grow."""
