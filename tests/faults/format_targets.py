@@ -315,6 +315,6 @@ BOX = json.dumps({"center": [0.0, 1.0, 2.0], "size": [1.0, 2.0, 3.0], "rotation"
 register(
     Target(
         "crop box", writing({"a.json": BOX.encode()}), lambda root, path: edit.box_of(str(path)),
-        (edit.box_of,), (json_value, json_value, text_number),
+        (edit.box_of,), (json_value, json_value, text_number), lines=0.85,
     )
 )  # fmt: skip
