@@ -268,8 +268,8 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     ("words", "hint"),
     [
         ("render RUN out.mp4", "Unrecognized options: out.mp4"),
-        ("render RUN --size 720 --fps 30", "--size: write it as --size 1080 1920;"),
-        ("plot RUN --size 720", "--size: write it as --size 1080 1920;"),
+        ("render RUN --size 720 --fps 30", "--size takes two numbers: --size 1080 1920;"),
+        ("plot RUN --size 720", "--size takes two numbers: --size 1080 1920;"),
         ("render --portrait RUN", "unknown flag --portrait; `warpgs render --help-all` lists the flags"),
         ("export RUN --to page.htm", "page.htm: format .htm is not supported; use one of"),
         ("view scene.html", "scene.html: is a web page; open this file in a browser"),

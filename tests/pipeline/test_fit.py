@@ -249,7 +249,7 @@ def test_units_lead_from_the_fit_to_its_files_and_back(folder, fitted, tmp_path)
     with torch.no_grad():
         rgb = warpgs.rasterize(result.gaussians(), camera, result.options()).rgb.numpy()
     assert np.abs(image / 255 - rgb.clip(0, 1)).max() < 0.51 / 255
-    with pytest.raises(UsageError, match="there is no camera"):
+    with pytest.raises(UsageError, match="no camera is given"):
         warpgs.render_path(result, [], out=tmp_path / "c")
 
 

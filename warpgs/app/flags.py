@@ -89,7 +89,7 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
         if flag not in known and flag not in said.replace("_", "-"):  # tyro took the word after it for its value
             raise UsageError(f"unknown flag {flag}; `{program} --help-all` lists the flags")
         if flag == "--size" and re.search("(parsing|argument) '?--size", said):
-            raise UsageError(f"--size: write it as --size 1080 1920; `{program} --help-all` shows what it takes")
+            raise UsageError(f"--size takes two numbers: --size 1080 1920; `{program} --help-all` shows what it takes")
     say_lines(said.splitlines(), error=True)
     raise UsageError(f"wrong arguments, as shown above; `{program} --help-all` lists them")
 

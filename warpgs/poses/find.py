@@ -107,7 +107,7 @@ _RECORD = schema.fields({
     "format": schema.one_of(FORMAT), "source_sha256": schema.text, "photographs": schema.items(_PHOTOGRAPH),
     "notes": schema.items(schema.text), "advice": schema.items(schema.text),
 }, {"source": schema.text})  # fmt: skip
-"""Schema of what is read of poses.json."""
+"""Schema of poses.json, for the fields that are read."""
 
 
 USUAL = (0.4, 2.5)

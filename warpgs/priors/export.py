@@ -208,7 +208,7 @@ class ExportRequest:
 
     def __post_init__(self):
         given = self.weights is not None
-        with explained(f"{self.model} cannot be exported so", "change or leave out that flag", ValueError, UsageError):
+        with explained(f"{self.model} is not exported", "change or leave out that flag", ValueError, UsageError):
             expect(self.model in MODELS, f"--model must be one of {', '.join(MODELS)}")
             fits = 32 <= self.size <= 4096 and self.size % MULTIPLE == 0
             expect(fits, f"--size must be a multiple of {MULTIPLE} from 32 to 4096, not {self.size}")

@@ -111,7 +111,7 @@ class FilmSettings:
     def __post_init__(self) -> None:
         """Check what can be checked before any work."""
         (least, most), (low, high) = paths.LIMITS["width"], paths.LIMITS["fov"]
-        with explained("a film cannot be so", "give another value", ValueError, UsageError):
+        with explained("these settings give no film", "change that number", ValueError, UsageError):
             expect(all(least <= s <= most for s in self.size or ()), f"sides must have {least} to {most} px, not {self.size}")
             fits = self.fov_y is None or math.radians(low) <= self.fov_y <= math.radians(high)
             expect(fits, f"--fov must be {low:g} to {high:g} degrees")
@@ -241,8 +241,8 @@ COVERAGE = "coverage"
 def check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size."""
     alone, one_size = out.suffix.lower() in SUFFIXES, len({(c.width, c.height) for _, c in plan.cameras}) == 1
-    with explained(f"{out}: cannot be rendered so", "give a folder, or leave out what it excludes", ValueError, UsageError):
-        expect(plan.cameras, "there is no camera")
+    with explained(f"{out}: not rendered", "give the name of a folder, or leave out that flag", ValueError, UsageError):
+        expect(plan.cameras, "no camera is given")
         expect(alone or not out.suffix or out.is_dir(), f"films end in {', '.join(SUFFIXES)}")
         expect(one_size or not (alone or sheet), "views differ in size, but a film or sheet needs one: give --size")
         expect(not (alone and coverage), "coverage images are PNG files in a folder")

@@ -380,7 +380,7 @@ def plot(
 ) -> list[str]:  # fmt: skip
     """Write a plot of a run as PNG, with the options of `warpgs plot`; returns lines for the user."""
     start, by_coverage, out = points == "start", color == "coverage", folder / PLOT if out is None else out
-    with explained(f"{out}: cannot be plotted", "change that flag", ValueError, UsageError):
+    with explained(f"{out}: not drawn", "change that flag", ValueError, UsageError):
         expect(all(SIZES[0] <= s <= SIZES[1] for s in size), f"each side of --size must have {SIZES[0]} to {SIZES[1]} px")
         expect(not (start and by_coverage), "--color coverage needs Gaussians, not --points start")
         expect(out.suffix.lower() == ".png", "a plot is a .png file")
