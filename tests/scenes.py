@@ -68,7 +68,9 @@ def priors(views: list[View]) -> list[Prior]:
 def view_stub(width: int = 504, height: int = 378, **changed: object) -> SimpleNamespace:
     """What the choice of settings reads of a view; all its pixels count unless changed. Its image is small at any size."""
     camera = SimpleNamespace(width=width, height=height)
-    return SimpleNamespace(**({"camera": camera, "image": np.ones((6, 8, 3)), "mask": None, "alpha": None} | changed))
+    return SimpleNamespace(
+        **({"camera": camera, "image": np.ones((6, 8, 3)), "mask": None, "alpha": None, "alpha_estimated": False} | changed)
+    )
 
 
 # Photographs of a flat card, computed ray by ray: what a model of it needs is known beforehand.

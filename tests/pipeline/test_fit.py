@@ -71,7 +71,7 @@ def fitted(folder):
 def test_a_short_fit_reports_no_moving_objects(folder, monkeypatch, long):
     """Its edges are blurred, which looks like motion; a tenth of the default's steps is enough."""
     monkeypatch.setattr(runs, "moved_fractions", lambda views, renders: [0.01] * len(views))
-    monkeypatch.setattr(runs, "steps_by_views", lambda views, opaque: STEPS * 10 + (not long))
+    monkeypatch.setattr(runs, "steps_by_views", lambda views, opaque, cutout: STEPS * 10 + (not long))
     result = warpgs.fit(str(folder / "scene"), CONFIG, split=SPLIT, device="cpu", verbose=False)
     assert any("something may have moved" in note for note in result.notes) == long
     assert (0.01 in [p["moved"] for p in result.metrics["photographs"]]) == long

@@ -301,7 +301,7 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
 
 PARTLY, FULL, DARK = np.eye(6, 8) > 0, np.ones((6, 8), bool), np.zeros((6, 8, 3))
 DARK[3, 3] = 1
-OPAQUE, CUT = {}, {"alpha": 1.0}
+OPAQUE, CUT, ESTIMATED = {}, {"alpha": 1.0}, {"alpha": 1.0, "alpha_estimated": True}
 LAYERS, UNSEEN, DECAY, SMOOTH = "method.hier", "init.extrapolate", "optimizer.opacities_decay", "loss.smooth_weight"
 LAST, GAIN, MEANS, SH = "optimizer.average_last", "stopping.min_gain_db", "optimizer.means_lr", "optimizer.sh_lr"
 
@@ -336,16 +336,22 @@ def value(config: FitConfig, name: str):
         # few views have smooth depth, in fits of at least 3000 steps, so not where a CPU limits them
         (4, OPAQUE, "cuda", {}, {SMOOTH: 1.0, "steps": 4500}),
         (5, OPAQUE, "cuda", {}, {SMOOTH: 0.0, "steps": steps_by_views(5)}),
-        (8, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": steps_by_views(8)}), (9, CUT, "cuda", {}, {SMOOTH: 0.0}),
-        (4, CUT, "cuda", {}, {SMOOTH: 0.5, "steps": 3000}), (4, OPAQUE, "cuda", {"steps": SMOOTH_STEPS - 1}, {SMOOTH: 0.0}),
+        (8, CUT, "cuda", {}, {SMOOTH: 0.5}), (9, CUT, "cuda", {}, {SMOOTH: 0.0}),
+        # an alpha channel, but not opacity that was estimated, has twice the steps, and a mean of the last ones
+        *((n, CUT, "cuda", {}, {LAST: 0.05, "steps": most}) for n, most in ((3, 6000), (8, 10_091), (300, 30_000))),
+        *((n, ESTIMATED, "cuda", {}, {LAST: 0.0, "steps": most}) for n, most in ((3, 3000), (8, 5045))),
+        (8, CUT, "cuda", {"max_steps": 500}, {LAST: 0.05, "steps": 500}), (4, OPAQUE, "cuda", {"steps": SMOOTH_STEPS - 1}, {SMOOTH: 0.0}),
         (4, OPAQUE, "cpu", {}, {SMOOTH: 0.0}), (4, OPAQUE, "cpu", {"cpu_limit": False}, {SMOOTH: 1.0}),
         *((4, OPAQUE, "cuda", {"preset": name}, {SMOOTH: 0.0}) for name in ("quick", "3dgs")),
         # many views have a mean of the last steps
         *((n, OPAQUE, "cuda", {}, {LAST: 0.0}) for n in (3, AVERAGED_VIEWS - 1)),
         *((n, OPAQUE, "cuda", {}, {LAST: 0.05}) for n in (AVERAGED_VIEWS, 300)),
-        # rates rise with more than nine views where the time of a CPU limits them, and nothing is held out
-        *((n, OPAQUE, d, {}, {MEANS: 1.6e-4, SH: 2.5e-3}) for n, d in ((9, "cpu"), (10, "cuda"))),
-        (10, OPAQUE, "cpu", {}, {MEANS: 4e-4, SH: 6.25e-3}),
+        # rates rise with more than nine views, at once where the time of a CPU limits them; then nothing is held out
+        *((9, OPAQUE, d, {}, {MEANS: 1.6e-4, SH: 2.5e-3}) for d in ("cpu", "cuda")),
+        *((n, OPAQUE, "cpu", {}, {MEANS: 4e-4, SH: 6.25e-3}) for n in (10, 60)),
+        *((n, OPAQUE, "cuda", {}, {MEANS: m, SH: h}) for n, m, h in ((18, 3.2e-4, 5e-3), (27, 4.8e-4, 7.5e-3), (99, 4.8e-4, 7.5e-3))),
+        # and steps grow more slowly with more than twelve views
+        *((n, OPAQUE, "cuda", {}, {"steps": most}) for n, most in ((9, 5511), (12, 6839), (54, 12_481), (1000, 30_000))),
         *((n, OPAQUE, d, {}, {GAIN: gain}) for n in (3, 12) for d, gain in (("cpu", 0.0), ("cuda", 0.1))),
         (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1, "sh_every": 500}),
         # nor where views have half size until growth ends, since nothing could end it

@@ -612,7 +612,7 @@ def _score(
     rule = results.rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
     moved: dict[str, float] = {}
-    if compare and trainer.step * c.batch >= SHARP * steps_by_views(len(train), not scene.transparent):
+    if compare and trainer.step * c.batch >= SHARP * steps_by_views(len(train), not scene.transparent, trainer.cutout):
         shown = counted(train, tell, "checking for moving objects", "views")
         moved = {v.name: f for v, f in zip(train, moved_fractions(train, (renders(v.camera) for v in shown)), strict=True)}
     complexity, cameras, scale = complexity_figures(trainer), folders.cameras_of(scene), scene.normalization.scale

@@ -482,10 +482,12 @@ def _unknown(name: str, config: FitConfig, keywords: bool) -> str:
 # The constants were chosen by leaving training views out (docs/decisions/013-any-capture.md); docs/results.md lists
 # exceptions.
 
-MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of up to `FEW` views: first for views with an alpha channel, then for opaque views."""
-FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
-"""Number of views above which steps exceed `MIN_STEPS`; exponent of this growth; and largest number of steps."""
+MIN_STEPS, OPAQUE_STEPS, ALPHA_STEPS = 3000, 4500, 6000
+"""Steps of a fit of up to `FEW` views: objects on black, opaque views, and views with an alpha channel
+(docs/decisions/034-objects-on-black.md)."""
+FEW, STEPS_POWER, MANY, MANY_POWER, MAX_STEPS = 4, 0.75, 12, 0.4, 30_000
+"""Number of views above which steps exceed `MIN_STEPS`, and exponent of this growth; number of views above which they grow
+more slowly, and exponent; and largest number of steps."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
 """Learning rate of the log scales for up to `SCALES_VIEWS` views, and exponent with which it falls for more views."""
 OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
@@ -511,7 +513,7 @@ EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 of opacities with such points. Fits with more views or fewer steps were not measured
 (docs/decisions/026-extrapolated-points.md)."""
 AVERAGED_VIEWS = 20
-"""Fewest training views with the mean of the last steps. With 12 views the gain is at most 0.04 dB
+"""Fewest training views without alpha channel that have the mean of the last steps. With 12 views the gain is at most 0.04 dB
 (docs/decisions/029-mean-of-the-last-steps.md)."""
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
@@ -538,19 +540,26 @@ FIRST_POINTS, FIRST_POWER, SWEPT_VIEWS = 2.4, 0.64, 30
 views; and number of views above which it does not grow."""
 FIRST_LOOK = 0.1
 """Upper bound of the time limit on a CPU for each of ``max_steps`` [s]: half a minute for the 300 of preset `quick`."""
-MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
-"""Learning rates of the means and of the constant colour; and the factor of both if the time limit on a CPU shortens the fit
-and there are more than `CPU_RATES_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
+MEANS_LR, SH_LR, RATES_VIEWS, MAX_RATES, CPU_RATES = 1.6e-4, 2.5e-3, 9, 3.0, 2.5
+"""Learning rates of the means and of the constant colour for up to `RATES_VIEWS` views. For more views, both rise in proportion
+to their number, up to a factor of `MAX_RATES` (docs/decisions/013-any-capture.md); `CPU_RATES` is their factor where the time
+limit on a CPU shortens the fit (docs/decisions/025-time-on-a-cpu.md)."""
 GAIN_DB, NEARLY_ALL = "0.3 to 1.6 dB on five scenes of 3 to 43 views", 0.9
 """Gain of PSNR by all steps over those within the time limit of a CPU (docs/decisions/025-time-on-a-cpu.md); and the fraction
 of the steps from which nothing of it is left."""
 
 
-def steps_by_views(views: int, opaque: bool = True) -> int:
-    """Return the largest number of steps for a number of views: 4500 up to 4 opaque views, 5511 for 9, 30,000 from 87 on."""
+def steps_by_views(views: int, opaque: bool = True, cutout: bool = False) -> int:
+    """Return the largest number of steps for a number of views: 4500 up to 4 opaque views, 5511 for 9, 12,481 for 54."""
     if opaque and views <= FEW:
         return OPAQUE_STEPS
-    return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
+    growth = max(1.0, min(views, MANY) / FEW) ** STEPS_POWER * max(1.0, views / MANY) ** MANY_POWER
+    return min(MAX_STEPS, round((ALPHA_STEPS if cutout else MIN_STEPS) * growth))
+
+
+def is_cutout(views: list[View]) -> bool:
+    """Return whether views have an opacity that was given, not estimated from a black background."""
+    return any(v.alpha is not None and not v.alpha_estimated for v in views)
 
 
 def step_times(
@@ -632,12 +641,12 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     def given(value: Any, other: Any) -> Any:
         return other if value is None else value
 
-    views, opaque = len(train), all(v.alpha is None for v in train)
+    views, opaque, cutout = len(train), all(v.alpha is None for v in train), is_cutout(train)
     one_layer = views <= ONE_LAYER_VIEWS
     hier = given(config.method.hier, not one_layer)
     degree = given(config.sh_degree, sum(views >= n for n in DEGREES))
     half = given(config.half_resolution, float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}"))
-    wanted = given(config.steps, min(steps_by_views(views, opaque), config.max_steps))
+    wanted = given(config.steps, min(steps_by_views(views, opaque, cutout), config.max_steps))
     limit, sh_every, most, steps = "", config.sh_every, config.max_gaussians, wanted
     if config.steps is None and config.cpu_limit and device == "cpu":
         pixels = max(v.camera.width * v.camera.height for v in train)
@@ -652,12 +661,13 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
         init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
     decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
-    factor = CPU_RATES if limited and views > CPU_RATES_VIEWS else 1.0
+    factor = min(MAX_RATES, max(1.0, views / RATES_VIEWS))
+    factor = CPU_RATES if limited and factor > 1 else factor
     rates = {
         "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
         "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
         "means_lr": factor * MEANS_LR, "sh_lr": factor * SH_LR, "opacities_decay": decay if one_layer else 0.0,
-        "average_last": AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0,
+        "average_last": AVERAGE_LAST if cutout or views >= AVERAGED_VIEWS else 0.0,
     }  # fmt: skip
     rates = {n: given(getattr(config.optimizer, n), float(f"{v:.3g}")) for n, v in rates.items()}
     if whole and degree and config.stopping.min_gain_db is None:
@@ -728,7 +738,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     probe = probe_seconds(largest.width, largest.height, device)
     setup, step = probe * SETUP * len(views), probe * STEP * config.batch
-    most = steps_by_views(len(views), all(v.alpha is None for v in views))
+    most = steps_by_views(len(views), all(v.alpha is None for v in views), is_cutout(views))
     steps = min(int((seconds - setup) / step), most)
     if steps < MIN_TIMED_STEPS:
         raise UsageError(

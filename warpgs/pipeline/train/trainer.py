@@ -25,7 +25,7 @@ from warpgs.pipeline.model.table import Column, Table, model_bytes
 from warpgs.pipeline.train.batch import BatchSteps, Tree
 from warpgs.pipeline.train.memory import Layout, most_instances, plan
 from warpgs.pipeline.train.schedule import Phases, StepReport, plan_phases, random_shift, sh_degree
-from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.settings import FitConfig, is_cutout
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
 from warpgs.pipeline.train.step import CAPACITY_FACTOR, OverLimitError, StepPlan, StepTaker, steps_at_once
 from warpgs.pipeline.train.stopping import STATE, Stopping
@@ -173,7 +173,7 @@ class Trainer:
         """Fraction of the planned steps, from the first step on, in which views have half size."""
         self.dropout = c.dropout * min(1.0, DROPOUT_VIEWS / len(train))
         """Dropout probability at the last step."""
-        self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one
+        self.cutout = is_cutout(train)  # then every view gets an opacity
         given = {n: any(getattr(v, n) is not None for v in train) for n in ("depth", "normals")}
         self.terms = terms_of(c, cutout=self.cutout, black=any(v.alpha_estimated for v in train), **given)
         self.step = 0  # taken
