@@ -20,7 +20,7 @@ from tools.run_docs import collect, main, pages, prepare, run_blocks, shortened
 from warpgs import PRESETS, read_ply
 from warpgs.app.cli import ASKING
 from warpgs.pipeline.train import settings as by_views
-from warpgs.pipeline.train.settings import FitConfig, settings_by_views
+from warpgs.pipeline.train.settings import MEANS_LR, FitConfig, settings_by_views
 from warpgs.synthetic.demo import write_demo
 
 ROOT = Path(__file__).parent.parent
@@ -76,15 +76,16 @@ def test_named_flags_are_there():
 
 def test_the_page_on_presets_says_what_the_rule_chooses():
     text = text_of("docs/presets.md")
-    rows = [[c.strip() for c in line.split("|")[3:-1]] for line in text[text.index("| setting | rule |") :].splitlines()[:12]]
+    rows = [[c.strip() for c in line.split("|")[3:-1]] for line in text[text.index("| setting | rule |") :].splitlines()[:13]]
     counts = [int(cell.split()[0]) for cell in rows[0]]
     assert len(counts) >= 5
     for column, views in enumerate(counts):
         train = [view_stub(8, 6)] * views
         config, _ = settings_by_views(PRESETS["default"], train, "cuda")
         chosen = (
-            config.steps, config.sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,
-            config.optimizer.opacities_decay, config.init.extrapolate, config.loss.smooth_weight, 1 + config.method.hier,
+            config.steps, config.sh_degree, round(config.optimizer.means_lr / MEANS_LR, 1), config.optimizer.scales_lr,
+            config.optimizer.opacities_lr, config.optimizer.opacities_decay,
+            config.init.extrapolate, config.loss.smooth_weight, 1 + config.method.hier,
             config.half_resolution, config.optimizer.average_last,
         )  # fmt: skip
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views

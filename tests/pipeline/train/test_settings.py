@@ -340,7 +340,8 @@ def value(config: FitConfig, name: str):
         # an alpha channel, but not opacity that was estimated, has twice the steps, and a mean of the last ones
         *((n, CUT, "cuda", {}, {LAST: 0.05, "steps": most}) for n, most in ((3, 6000), (8, 10_091), (300, 30_000))),
         *((n, ESTIMATED, "cuda", {}, {LAST: 0.0, "steps": most}) for n, most in ((3, 3000), (8, 5045))),
-        (8, CUT, "cuda", {"max_steps": 500}, {LAST: 0.05, "steps": 500}), (4, OPAQUE, "cuda", {"steps": SMOOTH_STEPS - 1}, {SMOOTH: 0.0}),
+        (8, CUT, "cuda", {"max_steps": 500}, {LAST: 0.05, "steps": 500}),
+        (4, OPAQUE, "cuda", {"steps": SMOOTH_STEPS - 1}, {SMOOTH: 0.0}),
         (4, OPAQUE, "cpu", {}, {SMOOTH: 0.0}), (4, OPAQUE, "cpu", {"cpu_limit": False}, {SMOOTH: 1.0}),
         *((4, OPAQUE, "cuda", {"preset": name}, {SMOOTH: 0.0}) for name in ("quick", "3dgs")),
         # many views have a mean of the last steps
@@ -349,7 +350,8 @@ def value(config: FitConfig, name: str):
         # rates rise with more than nine views, at once where the time of a CPU limits them; then nothing is held out
         *((9, OPAQUE, d, {}, {MEANS: 1.6e-4, SH: 2.5e-3}) for d in ("cpu", "cuda")),
         *((n, OPAQUE, "cpu", {}, {MEANS: 4e-4, SH: 6.25e-3}) for n in (10, 60)),
-        *((n, OPAQUE, "cuda", {}, {MEANS: m, SH: h}) for n, m, h in ((18, 3.2e-4, 5e-3), (27, 4.8e-4, 7.5e-3), (99, 4.8e-4, 7.5e-3))),
+        *((n, OPAQUE, "cuda", {}, {MEANS: m, SH: h}) for n, m, h in ((18, 3.2e-4, 5e-3), (27, 4.8e-4, 7.5e-3))),
+        (99, OPAQUE, "cuda", {}, {MEANS: 4.8e-4, SH: 7.5e-3}),
         # and steps grow more slowly with more than twelve views
         *((n, OPAQUE, "cuda", {}, {"steps": most}) for n, most in ((9, 5511), (12, 6839), (54, 12_481), (1000, 30_000))),
         *((n, OPAQUE, d, {}, {GAIN: gain}) for n in (3, 12) for d, gain in (("cpu", 0.0), ("cuda", 0.1))),

@@ -558,7 +558,7 @@ def steps_by_views(views: int, opaque: bool = True, cutout: bool = False) -> int
 
 
 def is_cutout(views: list[View]) -> bool:
-    """Return whether views have an opacity that was given, not estimated from a black background."""
+    """Return whether views have an alpha channel, or masks that cut an object out; not if a black background was estimated."""
     return any(v.alpha is not None and not v.alpha_estimated for v in views)
 
 
@@ -582,8 +582,8 @@ def step_times(
     counts = np.minimum(wanted, most)
     if growing:
         adding = samples & (steps > phases.refine) & (steps <= phases.stable_start)
-        room = min(config.max_gaussians, SATURATED * views * pixels)
-        counts = np.clip(counts + GROWN * np.cumsum(adding), counts, max(most, room))
+        room = max(most, min(config.max_gaussians, SATURATED * views * pixels))
+        counts = np.clip(counts + GROWN * np.cumsum(adding), counts, room)
     weighed = np.where(wanted > most, len(range(0, views, -(-views // MAX_WEIGHED))), 0)
     full = constant + of_pixel * pixels + (of_gaussian + of_coefficient * (config.sh_degree + 1) ** 2) * counts
     half = 0.75 * of_pixel * pixels * (steps <= config.half_resolution * config.steps)
@@ -656,13 +656,12 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     limited = steps < wanted
     phases = plan_phases(config.phases, steps)
     whole = limited or half * steps >= phases.stable_start  # a fit that nothing can end early holds nothing out
-    init = config.init
+    init, stopping = config.init, config.stopping
     if init.extrapolate is None:
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
         init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
     decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
-    factor = min(MAX_RATES, max(1.0, views / RATES_VIEWS))
-    factor = CPU_RATES if limited and factor > 1 else factor
+    factor = CPU_RATES if limited and views > RATES_VIEWS else min(MAX_RATES, max(1.0, views / RATES_VIEWS))
     rates = {
         "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
         "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
@@ -670,17 +669,16 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         "average_last": AVERAGE_LAST if cutout or views >= AVERAGED_VIEWS else 0.0,
     }  # fmt: skip
     rates = {n: given(getattr(config.optimizer, n), float(f"{v:.3g}")) for n, v in rates.items()}
-    if whole and degree and config.stopping.min_gain_db is None:
+    if whole and degree and stopping.min_gain_db is None:
         # as with held-out blocks, all degrees are in use when growth begins
         sh_every = min(sh_every, max(1, phases.refine // degree))
     smooth, few = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
     smooth = given(config.loss.smooth_weight, smooth if views <= few and steps >= SMOOTH_STEPS else 0.0)
-    min_gain = given(config.stopping.min_gain_db, 0.0 if whole else MIN_GAIN_DB)
     made = dataclasses.replace(
         config, steps=steps, max_gaussians=most, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init,
         optimizer=dataclasses.replace(config.optimizer, **rates), method=dataclasses.replace(config.method, hier=hier),
         loss=dataclasses.replace(config.loss, smooth_weight=smooth),
-        stopping=dataclasses.replace(config.stopping, min_gain_db=min_gain),
+        stopping=dataclasses.replace(stopping, min_gain_db=given(stopping.min_gain_db, 0.0 if whole else MIN_GAIN_DB)),
     )  # fmt: skip
     before = dict(_values(config))
     words = [f"{flag(n)} {value}" for n, value in _values(made) if value is not None and before[n] is None]
@@ -745,10 +743,9 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
             f"time-budget {seconds:g} s is too short: {MIN_TIMED_STEPS} steps would take {setup + MIN_TIMED_STEPS * step:.0f} "
             f"s here ({1000 * probe:.0f} ms for an image with gradients); give more time, or --downscale"
         )
-    needed = setup + steps * step
     return dataclasses.replace(config, steps=steps), (
-        f"time-budget {seconds:g} s: chose --steps {steps} for preset {config.preset}, predicted to take {needed:.0f} s "
-        f"({1000 * probe:.0f} ms for an image with gradients)"
+        f"time-budget {seconds:g} s: chose --steps {steps} for preset {config.preset}, predicted to take "
+        f"{setup + steps * step:.0f} s ({1000 * probe:.0f} ms for an image with gradients)"
         + (f"; {len(views)} views need no more steps" if steps == most else "")
         + "; poses, start, scores and report take additional time"
     )
