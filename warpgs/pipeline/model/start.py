@@ -267,8 +267,7 @@ def on_object(start: Start, views: list[View]) -> Start:
     if not shapes or keep.all():
         return start
     if (count := int(keep.sum())) < MIN_POINTS:
-        few = f"only {count} of these points are outside the empty areas of all views; check the poses"
-        return start._replace(how=f"{start.how}\n{few}")
+        return start._replace(how=f"{start.how}\nonly {count} points are outside the empty areas of all views; check the poses")
     how = f"{start.how}\n{len(keep) - count:,} of these points left out: they are in an empty area of a view"
     return start._replace(cloud=PointCloud(cloud.points[keep], cloud.colors[keep]), how=how)
 
@@ -286,18 +285,17 @@ def initial_points(
         cloud, made = random_points(views, config.random_count, generator)
         return Start(cloud, f"{made}, instead of --init.source hull: {how}")
     usable = seen_points(views, points)
-    by_depth = config.source in ("sweep", "flow")
     if config.source == "auto" and (sweeps(config, len(views)) or any_given(views)):
-        by_depth, config = True, replace(config, source="sweep")
-    if by_depth:
+        config = replace(config, source="sweep")
+    if config.source in ("sweep", "flow"):
         start = consistent_points(views, usable, config, generator, device, progress)
     elif config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
         start = Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
     else:
         start = Start(*random_points(views, config.random_count, generator))
         if config.source == "auto" and points is not None:
-            few = f"{start.how} (the reconstruction has only {len(usable)} points that the training views saw)"
-            start = start._replace(how=few)
+            few = f"the reconstruction has only {len(usable)} points that the training views saw"
+            start = start._replace(how=f"{start.how} ({few})")
     start = on_object(start, views)
     if config.extrapolate and start.depths is None:
         return start._replace(how=f"{start.how}\nno extrapolated points: they need --init.source sweep or flow")
@@ -331,11 +329,10 @@ def initial_gaussians(
     """
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
     colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
-    count = len(points)
     # in float64, since the rounding of float32's roots and logarithms depends on the processor (MKL)
     scales = config.scale_factor * mean_square_distances(points).double().sqrt().clamp(1e-6 * extent, 0.1 * extent)
-    logits = points.new_full((count,), geometry.logit(config.opacity))
-    logits[count - extrapolated :] = geometry.logit(depth_points.EXTRAPOLATED_OPACITY)
+    logits = points.new_full((len(points),), geometry.logit(config.opacity))
+    logits[len(points) - extrapolated :] = geometry.logit(depth_points.EXTRAPOLATED_OPACITY)
     return isotropic(points, colors, scales.log().to(points.dtype), logits, coefficient_count(sh_degree))
 
 
