@@ -285,6 +285,8 @@ def test_alpha_arrives_in_every_format(write, tmp_path):
     np.testing.assert_allclose(first.image, scenes.image(0) / 255 * (alpha / 255)[..., None], atol=1e-6)
     assert first.alpha.dtype == np.float32 and first.mask is None and scene.background == (0, 0, 0)
     assert second.alpha is None and "1 image transparent in part, by the alpha channel" in scene.notes
+    opaque = f"{len(scene.views) - 1} of {len(scene.views)} images have no transparent pixel, and count as opaque everywhere"
+    assert opaque in scene.notes
     other = first.alpha.copy()
     other[3, 3] = 0.25
     assert fingerprint([first]) != fingerprint([dataclasses.replace(first, alpha=other)])

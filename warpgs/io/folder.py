@@ -539,6 +539,8 @@ class ViewList:
         """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
         self._load()
         notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
+        if 0 < (opaque := sum(v.alpha is None for v in self._views)) < len(self._views):
+            notes.append(f"{opaque} of {len(self._views)} images have no transparent pixel, and count as opaque everywhere")
         if self._narrow:
             name, left = min(self._narrow.items(), key=lambda item: item[1])
             many = f"the lens distortion leaves few pixels of {len(self._narrow)} images, {left:.0%} of {name}"

@@ -104,6 +104,8 @@ def test_a_file_starts_from_another(tmp_path):
     [
         ("stpes = 3", "my.toml: unknown setting 'stpes'; did you mean steps?"),
         ("[init]\nopacty = 3", "unknown setting 'init.opacty'; did you mean init.opacity?"),
+        ("[init]\nmerge-pix = 3", "unknown setting 'init.merge-pix'; did you mean init.merge-px?"),
+        ("merge-px = 3", "unknown setting 'merge-px'; did you mean init.merge-px?"),
         ('strategy = "mcmc"\n[densty]\nevery = 3', "unknown setting 'densty.every'; did you mean density.every?"),
         ("steps = 3.5", "steps must be a whole number of 64 bits, not 3.5"),
         ("steps = 0", "my.toml: steps must be at least 1, not 0"),

@@ -44,8 +44,8 @@ class OptimizerConfig(Checked, group="optimizer."):
     """Learning rates, by default those of the reference implementation of Kerbl et al. 2023, except for the scales."""
 
     means_lr: LearningRate | None = 1.6e-4
-    """Learning rate of the means at the start, in units of the scene's extent. None: 1.6e-4, or more if --cpu-limit shortens
-    the fit."""
+    """Learning rate of the means at the start, in units of the scene's extent. None: chosen by the number of views and by
+    --cpu-limit (docs/presets.md)."""
     scales_lr: LearningRate | None = 0.01
     """Learning rate of the log scales; 0.005 in the reference implementation (docs/decisions/004-scale-rate.md). None: chosen
     by the number of views."""
@@ -57,10 +57,10 @@ class OptimizerConfig(Checked, group="optimizer."):
     opacities_decay: Annotated[float | None, Within(0, MAX_DECAY)] = 0.0
     """Fraction by which each step lowers every opacity, in [0, 0.1]; 0 for no decay. None: chosen by the number of views."""
     sh_lr: LearningRate | None = 2.5e-3
-    """Learning rate of the constant colour coefficient. None: 2.5e-3, or more if --cpu-limit shortens the fit."""
+    """Learning rate of the constant colour coefficient. None: chosen as that of the means."""
     average_last: Annotated[float | None, Within(0, 1)] = 0.0
     """Fraction of the steps, the last ones, over which the parameters are averaged; the mean is the result of the fit. 0 for no
-    mean. None: chosen by the number of views."""
+    mean. None: chosen by the views."""
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
         """Return the learning rate of each parameter.

@@ -47,9 +47,9 @@ class FitConfig(Checked):
     """Preset that the other settings start from: a name, a .toml file of settings, or your own FitConfig or mapping as
     module:NAME or path/to/file.py:NAME."""
     steps: Annotated[int | None, Within(1)] = 7000
-    """Number of optimisation steps; early stopping may end the fit sooner. None: chosen by the number of views."""
+    """Number of optimisation steps; early stopping may end the fit sooner. None: chosen by the views."""
     max_steps: Annotated[int, Within(1)] = 30_000
-    """Largest number of steps that is chosen by the number of views."""
+    """Largest number of steps that is chosen by the views."""
     batch: Annotated[int, Within(1)] = 1
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
@@ -329,7 +329,7 @@ def with_settings(config: FitConfig, values: Mapping[str, Any], place: str, *, k
             if name in ("strategy", *PARTS, *VIEW_MODULES.names()):
                 continue
             if name not in names:
-                raise UsageError(_unknown(name, config, keywords))
+                raise UsageError(_unknown(name if keywords else flag(name), config, keywords))
             path, hint = leaves[names[name]]
             inner = changes
             for part in path[:-1]:
@@ -465,13 +465,13 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
 
 def _unknown(name: str, config: FitConfig, keywords: bool) -> str:
     """Return the message on an unknown setting, with the most similar name in the user's spelling."""
-    known = {keyword(n) if keywords else n: n for n in setting_names(config)}
+    known = {keyword(n) if keywords else flag(n): n for n in setting_names(config)}
     groups = {n.partition(".")[0] for n in known.values() if "." in n}
     if note := removed_note(name):
         return note
-    if name in groups:
+    if name.replace("-", "_") in groups:
         return f"{name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
-    last = [k for k, n in known.items() if n.rpartition(".")[2] == name]  # `opacity` for `init.opacity`
+    last = [k for k, n in known.items() if n.rpartition(".")[2] == name.replace("-", "_")]  # `opacity` for `init.opacity`
     hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
     return f"unknown setting {name[:60]!r}; {hint}"
 
