@@ -278,18 +278,37 @@ def test_alpha_arrives_in_every_format(write, tmp_path):
     alpha = np.full((12, 16), 255, np.uint8)
     scenes.save(tmp_path / "images" / "photo1.png", rgba(1, alpha))
     alpha[:, :4], alpha[0] = 100, 0
-    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, alpha))
+    for i in (0, 2, 3):
+        scenes.save(tmp_path / "images" / f"photo{i}.png", rgba(i, alpha))
     scene = load_scene(tmp_path)
     first, second, *_ = scene.views
     np.testing.assert_allclose(first.alpha, alpha / 255, atol=1e-6)
     np.testing.assert_allclose(first.image, scenes.image(0) / 255 * (alpha / 255)[..., None], atol=1e-6)
     assert first.alpha.dtype == np.float32 and first.mask is None and scene.background == (0, 0, 0)
-    assert second.alpha is None and "1 image transparent in part, by the alpha channel" in scene.notes
-    opaque = f"{len(scene.views) - 1} of {len(scene.views)} images have no transparent pixel, and count as opaque everywhere"
+    assert second.alpha is None and "3 images transparent in part, by the alpha channel" in scene.notes
+    opaque = f"{len(scene.views) - 3} of {len(scene.views)} images have no transparent pixel, and count as opaque everywhere"
     assert opaque in scene.notes
     other = first.alpha.copy()
     other[3, 3] = 0.25
     assert fingerprint([first]) != fingerprint([dataclasses.replace(first, alpha=other)])
+
+
+@pytest.mark.parametrize(("count", "clear", "object_"), [(1, 6, False), (5, 1, False), (5, 6, True), (2, 6, False)])
+def test_a_few_transparent_pixels_are_masked_and_make_no_object(count, clear, object_, tmp_path):
+    """A speck in one photograph, or one cut-out photograph among others, does not change how the scene is fitted."""
+    scenes.write_transforms(tmp_path)
+    alpha = np.full((12, 16), 255, np.uint8)
+    alpha[2 : 2 + clear, 1], alpha[2, 2] = 0, 128
+    for i in range(count):
+        scenes.save(tmp_path / "images" / f"photo{i}.png", rgba(i, alpha))
+    scene = load_scene(tmp_path)
+    first, share = scene.views[0], count / len(scene.views) * (clear + 127 / 255) / 192
+    note = f"their transparent pixels, {share:.2%} of all, do not count, like masked ones: no cut-out object"
+    assert len(scene.views) == 5 and (first.alpha is not None) is object_ and (note in scene.notes) is not object_
+    if not object_:
+        np.testing.assert_array_equal(first.mask, alpha == 255)
+        np.testing.assert_allclose(first.image[first.mask], scenes.image(0)[first.mask] / 255, atol=1e-6)
+        assert not any("count as opaque" in note for note in scene.notes)
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.5, 0.25)])

@@ -459,6 +459,8 @@ def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: 
 
 MIN_SEEN = 0.5
 """Smallest fraction of the pixels of an image that a usual lens leaves."""
+MIN_CUT, MIN_CUT_VIEWS = 0.02, 0.5
+"""Smallest transparent fraction of all pixels, and smallest fraction of images with some, where images show a cut-out object."""
 
 
 LOADERS, MOST_LOADERS, LOADER_BYTES = 4, 16, 2**32
@@ -469,6 +471,12 @@ number where each has this much free memory [bytes], which is enough for 100 meg
 def loaders() -> int:
     """Return the number of threads that load images on this machine."""
     return min(usable_cores(), max(LOADERS, min(MOST_LOADERS, machine_memory()[1] // LOADER_BYTES)))
+
+
+def _masked_by_alpha(view: View, alpha: np.ndarray) -> View:
+    """Return a view whose transparent pixels are masked, also those that are transparent in part."""
+    mask = alpha > 1 - 1e-3  # a mean of ones may be rounded
+    return replace(view, mask=mask if view.mask is None else mask & view.mask, alpha=None)
 
 
 class ViewList:
@@ -485,6 +493,7 @@ class ViewList:
         self._done: Counter[str] = Counter()
         self._kept: dict[str, float] = {}
         self._narrow: dict[str, float] = {}
+        self._specks: list[str] = []
         self._names: set[str] = set()
 
     def claim(self, name: str, where: str) -> str:
@@ -519,6 +528,11 @@ class ViewList:
                 if self._on_image is not None:
                     self._on_image(name)
                 self._append(name, viewmat, loaded)
+        clear = [0.0 if v.alpha is None else float(1 - v.alpha.mean()) for v in self._views]
+        share, many = math.fsum(clear) / max(1, len(clear)), sum(c > 0 for c in clear)
+        if many and "cut out by a mask file" not in self._done and (share < MIN_CUT or many < MIN_CUT_VIEWS * len(clear)):
+            self._specks = [f"their transparent pixels, {share:.2%} of all, do not count, like masked ones: no cut-out object"]
+            self._views = [v if v.alpha is None else _masked_by_alpha(v, v.alpha) for v in self._views]
 
     def _append(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         if loaded.kept is not None:
@@ -538,7 +552,7 @@ class ViewList:
     def notes(self, options: ReadOptions | None = None) -> list[str]:
         """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
         self._load()
-        notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
+        notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())] + self._specks
         if 0 < (opaque := sum(v.alpha is None for v in self._views)) < len(self._views):
             notes.append(f"{opaque} of {len(self._views)} images have no transparent pixel, and count as opaque everywhere")
         if self._narrow:
