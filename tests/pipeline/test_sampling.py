@@ -66,6 +66,14 @@ def test_a_continued_fit_expects_the_same_gaussians_and_only_the_rest_of_the_tim
     assert planned_times(job, advanced(later))[1] == []
 
 
+def test_the_user_is_told_when_photographs_of_full_size_lower_the_psnr():
+    """Only while they are still half their size."""
+    config = dataclasses.replace(CONFIG, half_resolution=0.5)
+    job: Any = SimpleNamespace(device=CPU, config=config, train=photos(3))
+    notes = [planned_times(job, fitted(config, steps=n))[1][0] for n in (0, 20)]
+    assert ["PSNR falls after step 20, where photographs have full size" in n for n in notes] == [True, False]
+
+
 def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> DensityUpdate:
     """A change that keeps some rows and appends copies of the first row, grown from these parents."""
     rows = torch.tensor(range(keep) if isinstance(keep, int) else keep)

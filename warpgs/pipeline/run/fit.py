@@ -192,7 +192,10 @@ def planned_times(job: FitJob, trainer: Trainer) -> tuple[Sequence[float] | None
     times, counts = step_times(config, len(job.train), pixels, trainer.first_count, growing=True)
     left, last = times[trainer.step : trainer.steps], counts[trainer.steps - 1]
     took = f"{len(left):,} steps take about {duration(WHOLE_FIT * left.sum())} on two idle cores, besides start and report"
-    return times.tolist(), [f"{took}; they end with about {float(f'{last:.2g}'):,.0f} Gaussians"] * (len(left) > 0)
+    took += f"; they end with about {float(f'{last:.2g}'):,.0f} Gaussians"
+    if trainer.step < (half := int(trainer.half_resolution * trainer.phases.planned)):
+        took += f"; PSNR falls after step {half:,}, where photographs have full size"
+    return times.tolist(), [took] * (len(left) > 0)
 
 
 def _explained(job: FitJob, trainer: Trainer, error: NotFiniteError, view: int) -> NotFiniteError:
