@@ -8,6 +8,7 @@ import pytest
 
 from tests.scenes import ring, textured_photos as photos
 from warpgs.priors.photo_checks import check_photos, photo_notes
+from warpgs.process import Task
 
 GAIN = np.array([1.25, 1.0, 0.8], np.float32)
 
@@ -75,6 +76,27 @@ def test_faults_are_told_apart_and_what_cannot_be_compared_is_said(sharp):
     checks = check_photos(_with(sharp, 4, np.full_like(sharp[4].image, 0.5)))
     assert (checks[4].compared_with, checks[4].sharpness, checks[4].brightness, checks[4].channels) == (0, None, None, None)
     assert photo_notes(checks) == [f"blur and exposure not checked, too few matches: {sharp[4].name}"]
+
+
+@pytest.mark.parametrize("mistake", ["inverse", "axes", "focal length"])
+def test_cameras_that_do_not_fit_the_photographs_are_doubted(sharp, mistake):
+    """Right ones are not: poses from world to camera, the axes of OpenGL, a focal length in millimetres."""
+
+    def wrong(camera):
+        viewmat, K = camera.viewmat, camera.K
+        if mistake == "inverse":
+            viewmat = np.linalg.inv(viewmat)
+        elif mistake == "axes":
+            viewmat = np.diag([1, -1, -1, 1]) @ viewmat
+        else:
+            K = K * np.array([[0.07, 1, 1], [1, 0.07, 1], [1, 1, 1]])
+        return dataclasses.replace(camera, viewmat=viewmat, K=K)
+
+    checks = check_photos([dataclasses.replace(v, camera=wrong(v.camera)) for v in sharp])
+    (note, *_) = photo_notes(checks)
+    assert isinstance(note, Task) and "the cameras do not fit the photographs" in note and "not checked" not in note
+    right = check_photos(sharp)
+    assert [c.matches for c in checks] == [c.matches for c in right] and all(c.agreeing > 0.5 * c.matches for c in right)
 
 
 def test_photographs_that_stand_close_together_are_compared():

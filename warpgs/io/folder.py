@@ -460,7 +460,7 @@ def missing_note(missing: list[str], total: int, noun: str, file: Path, strict: 
 MIN_SEEN = 0.5
 """Smallest fraction of the pixels of an image that a usual lens leaves."""
 MIN_CUT, MIN_CUT_VIEWS = 0.02, 0.5
-"""Smallest transparent fraction of all pixels, and smallest fraction of images with some, where images show a cut-out object."""
+"""Smallest transparent fraction of all pixels, and of images with some, where images show a cut-out object."""
 
 
 LOADERS, MOST_LOADERS, LOADER_BYTES = 4, 16, 2**32

@@ -245,11 +245,11 @@ def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None, device: 
 
 def agreeing_matches(
     a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE, device: torch.device = CPU
-) -> tuple[np.ndarray, np.ndarray]:
-    """Match two views' features; return rows [N, 2] and points [N, 3] [u] of matches that agree with the poses."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Match two views' features; return rows [N, 2] and points [N, 3] [u] of matches that agree with the poses, of how many."""
     ids = _ratio_matches(first[1], second[1], device)
     found, good = _triangulate(a, b, first[0][ids[:, 0]], second[0][ids[:, 1]], min_angle)
-    return ids[good], found[good]
+    return ids[good], found[good], len(ids)
 
 
 def _triangulate(a: View, b: View, at_a: np.ndarray, at_b: np.ndarray, min_angle: float) -> tuple[np.ndarray, np.ndarray]:
@@ -287,12 +287,12 @@ def triangulate_matches(views: list[View], device: Callable[[], torch.device] = 
     features = dict(zip(chosen, in_threads(lambda i: sift_features(views[i]), chosen, most=most)))
     own = device() if sum(len(features[i][0]) * len(features[j][0]) for i, j in pairs) > MANY else CPU
 
-    def match(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def match(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, int]:
         return agreeing_matches(*(views[i] for i in pair), *(features[i] for i in pair), device=own)
 
     matched = in_threads(match, pairs)
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)]
-    for (i, _), (ids, found) in zip(pairs, matched):
+    for (i, _), (ids, found, _) in zip(pairs, matched):
         at = features[i][0][ids[:, 0]].astype(int)
         points.append(found)
         colors.append(views[i].image[at[:, 1], at[:, 0]])

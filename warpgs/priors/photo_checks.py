@@ -30,6 +30,9 @@ NEIGHBORS = 4
 """Each photograph is compared with this many nearest ones, and with all that have it among their nearest ones."""
 MIN_MATCHES = 10
 """Smallest number of matches for a comparison of two photographs."""
+MIN_AGREEMENT, MIN_TRIED = 0.3, 50
+"""Fraction of the matches that agree with the poses below which cameras are doubted, and fewest matches that tell. Right
+cameras of twelve captures have 0.41 and more; inverse poses, other axes and a focal length 14 times too short at most 0.26."""
 MAX_FEATURES = 1000
 """Largest number of features of a photograph, which bounds the time of a comparison."""
 MAX_PIXELS = 100_000
@@ -56,6 +59,10 @@ class PhotoCheck:
     """Name of the view."""
     compared_with: int
     """Number of photographs that this one could be compared with."""
+    matches: int
+    """Number of its features that match one of another photograph."""
+    agreeing: int
+    """Number of these matches that agree with the poses."""
     sharpness: float | None
     """Ratio of fine to coarse detail, divided by the same ratio of the other photographs; 1 if equally sharp."""
     brightness: float | None
@@ -80,18 +87,20 @@ def _places(view: View) -> Places:
     return features, 0.5 * np.log((bands[0] + NOISE) / (bands[1] + NOISE)), colors
 
 
-def _difference(views: Sequence[View], places: Sequence[Places | None], i: int, j: int) -> np.ndarray | None:
-    """Return log factors [4] of detail, red, green, blue of photograph i over j, NaN if unknown; None without matches."""
+def _difference(views: Sequence[View], places: Sequence[Places | None], i: int, j: int) -> tuple[int, int, np.ndarray | None]:
+    """Return numbers of matches and of agreeing ones, and log factors of photograph i over j; None with few matches.
+
+    Factors [4] are those of detail, red, green and blue, NaN if unknown.
+    """
     (first, detail_a, colors_a), (second, detail_b, colors_b) = places[i], places[j]
-    ids, _ = agreeing_matches(views[i], views[j], first, second, min_angle=0.0)
+    ids, _, tried = agreeing_matches(views[i], views[j], first, second, min_angle=0.0)
     if len(ids) < MIN_MATCHES:
-        return None
+        return tried, len(ids), None
     detail = np.median(detail_a[ids[:, 0]] - detail_b[ids[:, 1]])
     both = np.stack([colors_a[ids[:, 0]], colors_b[ids[:, 1]]])
     usable = ((both > DARKEST) & (both < BRIGHTEST)).all((0, 2))
-    if usable.sum() < MIN_MATCHES:
-        return np.array([detail, np.nan, np.nan, np.nan])
-    return np.array([detail, *np.median(np.log(both[0, usable] / both[1, usable]), axis=0)])
+    colors = np.median(np.log(both[0, usable] / both[1, usable]), axis=0) if usable.sum() >= MIN_MATCHES else [np.nan] * 3
+    return tried, len(ids), np.array([detail, *colors])
 
 
 def _typical(differences: list[float]) -> float | None:
@@ -108,25 +117,26 @@ def check_photos(views: Sequence[View], stopped: Callable[[], bool] = lambda: Fa
     pairs = sorted({(min(i, j), max(i, j)) for i in range(len(views)) for j in nearest_views(views, i, NEIGHBORS)})
     with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:
         places = [*pool.map(lambda view: None if stopped() else _places(view), views)]
-        found = [*pool.map(lambda pair: None if stopped() else _difference(views, places, *pair), pairs)]
+        found = [*pool.map(lambda pair: (0, 0, None) if stopped() else _difference(views, places, *pair), pairs)]
     differences: list[list[np.ndarray]] = [[] for _ in views]
-    for (i, j), difference in zip(pairs, found, strict=True):
-        if difference is not None:
-            differences[i].append(difference)
-            differences[j].append(-difference)
-    return [_check(v.name, d) for v, d in zip(views, differences, strict=True)]
+    counts = np.zeros((len(views), 2), int)
+    for pair, (tried, agreeing, difference) in zip(pairs, found, strict=True):
+        for k, sign in zip(pair, (1, -1), strict=True):
+            counts[k] += tried, agreeing
+            differences[k] += [] if difference is None else [sign * difference]
+    return [_check(v.name, d, *map(int, n)) for v, d, n in zip(views, differences, counts, strict=True)]
 
 
-def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
-    """Return the check of a photograph from its differences to others, as `_difference` gives them."""
+def _check(name: str, differences: list[np.ndarray], *matches: int) -> PhotoCheck:
+    """Return the check of a photograph from its differences to others, as `_difference` gives them, and numbers of matches."""
     if not differences:
-        return PhotoCheck(name, 0, None, None, None)
+        return PhotoCheck(name, 0, *matches, None, None, None)
     detail, *colors = (_typical([float(d[k]) for d in differences]) for k in range(4))
     factor = None if detail is None else round(math.exp(detail), 3)
     if len(known := [c for c in colors if c is not None]) < 3:
-        return PhotoCheck(name, len(differences), factor, None, None)
+        return PhotoCheck(name, len(differences), *matches, factor, None, None)
     channels = tuple(round(math.exp(c), 3) for c in known)
-    return PhotoCheck(name, len(differences), factor, round(math.exp(sum(known) / 3), 3), channels)
+    return PhotoCheck(name, len(differences), *matches, factor, round(math.exp(sum(known) / 3), 3), channels)
 
 
 def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
@@ -145,5 +155,12 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
          [f"{name} (red {red:.2f}, green {green:.2f}, blue {blue:.2f} x)" for name, (red, green, blue) in tints]),
     )  # fmt: skip
     notes: list[str] = [Task(f"{what}: {listed(named, MAX_NAMED)}; {remedy}") for what, remedy, named in faults if named]
+    tried, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
+    if tried >= 2 * MIN_TRIED and agreeing < MIN_AGREEMENT * tried:  # both photographs count a match
+        words = (
+            f"the cameras do not fit the photographs: only {agreeing / tried:.0%} of {tried // 2:,} matches agree with them; "
+        )
+        words += "check that poses have the direction (from camera to world, or back) and axes of the format"
+        return [Task(f"{words}, and that focal lengths are in pixels"), *notes]
     alone = [c.name for c in checks if not c.compared_with]
     return [*notes, *([f"blur and exposure not checked, too few matches: {listed(alone, MAX_NAMED)}"] if alone else [])]

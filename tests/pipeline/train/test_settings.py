@@ -360,6 +360,10 @@ def value(config: FitConfig, name: str):
         (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1, "sh_every": 500}),
         # nor where views have half size until growth ends, since nothing could end it
         *((n, OPAQUE, "cuda", {"preset": "quick"}, {GAIN: 0.0, "sh_every": every}) for n, every in ((3, 500), (40, 20))),
+        # from ten views on, a fifth of the steps has half size, fewer where the time of a CPU limits them
+        (40, OPAQUE, "cpu", {}, {"half_resolution": 0.05}),
+        (40, OPAQUE, "cuda", {"half_resolution": 0.0}, {"half_resolution": 0.0}),
+        *((n, OPAQUE, "cuda", {}, {"half_resolution": h}) for n, h in ((4, 0.5), (8, 0.25), (10, 0.2), (300, 0.2))),
         *((12, OPAQUE, "cuda", {"steps": 1000, "half_resolution": h}, {GAIN: g}) for h, g in ((0.7, 0.0), (0.69, 0.1))),
     ],
 )  # fmt: skip
@@ -470,7 +474,8 @@ def test_the_time_of_a_cpu_limits_steps_and_images():
     nearly = settings_by_views(PRESETS["quick"], [view_stub(610, 850)] * 30, "cpu")[1][-1]
     assert re.search("takes 29[0-9] of 300 steps and has at most [0-9,]+ Gaussians; --no-cpu-limit .* 1 min$", nearly), nearly
     # from the first points to three times as many at the events, which take longer; views of half size take less time
-    made, _ = settings_by_views(dataclasses.replace(PRESETS["default"], steps=600), [view_stub(800, 450)] * 40, "cpu")
+    asked = dataclasses.replace(PRESETS["default"], steps=600, half_resolution=0.05)
+    made, _ = settings_by_views(asked, [view_stub(800, 450)] * 40, "cpu")
     events = plan_phases(made.phases, 600).events
     times, counts = step_times(made, 40, 360_000, 100_000)
     assert counts[0] == counts[events[0] - 2] == 100_000 and counts[-1] == 300_000 and bool((np.diff(counts) >= 0).all())

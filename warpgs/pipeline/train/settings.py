@@ -495,7 +495,7 @@ OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
 value."""
 HALF_RESOLUTION, HALF_VIEWS, LEAST_HALF = 0.5, 4, 0.2
 """Fraction of the steps at half size for up to `HALF_VIEWS` views; for more views it is inversely proportional to their
-number, down to `LEAST_HALF`."""
+number, down to `LEAST_HALF` unless the time limit on a CPU shortens the fit (docs/decisions/013-any-capture.md)."""
 DEGREES = (5, 9, 12)
 """Fewest training views for spherical harmonics of degree 1, 2 and 3. With fewer, colours do not depend on the view: four
 photographs cannot distinguish a view-dependent colour from an error of the shape."""
@@ -645,7 +645,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     one_layer = views <= ONE_LAYER_VIEWS
     hier = given(config.method.hier, not one_layer)
     degree = given(config.sh_degree, sum(views >= n for n in DEGREES))
-    half = given(config.half_resolution, float(f"{max(LEAST_HALF, HALF_RESOLUTION * min(1.0, HALF_VIEWS / views)):.2g}"))
+    half = given(config.half_resolution, float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}"))
     wanted = given(config.steps, min(steps_by_views(views, opaque, cutout), config.max_steps))
     limit, sh_every, most, steps = "", config.sh_every, config.max_gaussians, wanted
     if config.steps is None and config.cpu_limit and device == "cpu":
@@ -654,6 +654,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         asked = dataclasses.replace(config, steps=wanted, half_resolution=half, sh_degree=degree, method=method)
         steps, most, limit = limited_on_cpu(asked, views, pixels)
     limited = steps < wanted
+    half = half if limited else given(config.half_resolution, max(LEAST_HALF, half))
     phases = plan_phases(config.phases, steps)
     whole = limited or half * steps >= phases.stable_start  # a fit that nothing can end early holds nothing out
     init, stopping = config.init, config.stopping
