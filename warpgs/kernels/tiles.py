@@ -552,7 +552,7 @@ def bin_tiles(
     cameras, per_camera, _ = projected.shape
     (*origin, width, height), tile_size, rule = settings.window, settings.tile_size, settings.rule
     columns, rows = grid(width, height, tile_size)
-    no_tile = cameras * columns * rows
+    no_tile = int(cameras * columns * rows)  # sizes of numpy have no bit_length
     if no_tile > launch.MAX_SIZE:
         raise ResourceError(f"{cameras:,} images of {width} x {height} px have too many tiles; render fewer at once")
     counts = tile_counts.contiguous().view(-1)

@@ -441,10 +441,13 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
         ResourceError: The file cannot be written.
         TypeError: The Gaussians have other parameters (``stored()`` of `ActivatedGaussians` converts them), or tensors differ
             in type.
-        UsageError: The units are unknown, or scene units are given without a normalization.
+        UsageError: The suffix is that of another format, the units are unknown, or scene units are given without a
+            normalization.
         ValueError: The shapes of the tensors do not match.
     """
     where = f"{path}: not written"
+    if (suffix := Path(path).suffix.lower()) in (".ply", ".spz", ".sog", ".splat", ".ksplat"):
+        raise UsageError(f"{where}: this writes safetensors, not {suffix}; use warpgs.write_ply, or `warpgs export`")
     _check_values(gaussians, where)
     normalization = checked_normalization(normalization, units, where)
     similarity = {name: json.dumps(value) for name, value in similarity_values(normalization).items()}
@@ -463,7 +466,9 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
         DataError: The file is missing, damaged, or not a model.
     """
     path = Path(path)
-    tensors, header, _ = read_tensors(path, "check the path and its permissions", "write it again with warpgs.save")
+    tensors, header, _ = read_tensors(
+        path, "check the path and its permissions", "write it again with warpgs.save, or read PLY with warpgs.read_ply"
+    )
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     fix = "write it again with warpgs.save"
