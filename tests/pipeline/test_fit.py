@@ -276,7 +276,7 @@ def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
     made = result.gaussians()
     assert made.sh.shape[1] == 25 and bool(made.sh[:, 16:].any())
     warpgs.save(tmp_path / "model.safetensors", made, scene.normalization)
-    with pytest.raises(warpgs.UsageError, match="writes safetensors, not .ply"):
+    with pytest.raises(warpgs.UsageError, match=r"writes safetensors, not \.ply"):
         warpgs.save(tmp_path / "model.PLY", made, scene.normalization)
     stored = warpgs.open_run(out, "cpu").gaussians(), warpgs.load(tmp_path / "model.safetensors").gaussians()
     assert all(torch.equal(g.sh, made.sh) for g in stored)

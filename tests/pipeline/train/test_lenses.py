@@ -31,7 +31,7 @@ from warpgs.pipeline.model.limits import LimitConfig, camera_rows
 from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
 from warpgs.pipeline.run.commands import open_file
 from warpgs.pipeline.train import step, trainer
-from warpgs.pipeline.train.loss import AlphaDifference, EmptyOpacity, LossConfig, LossInputs, Target
+from warpgs.pipeline.train.loss import INSIDE, AlphaDifference, CertainOpacity, LossConfig, LossInputs, Target
 from warpgs.pipeline.train.memory import most_instances
 from warpgs.pipeline.train.schedule import over, random_shift
 from warpgs.pipeline.train.settings import FitConfig, settings_by_views
@@ -455,22 +455,25 @@ def test_alpha_term_is_a_mean_absolute_difference(masked):
     assert term(true) == pytest.approx(0.5 * float(expected), rel=1e-5) and term(None) == 0
 
 
-def test_opacity_counts_only_away_from_an_object_on_black():
+def test_opacity_counts_only_away_from_the_edge_of_an_object_on_black():
     """At 4 px of an image whose diagonal is 800 px; the term is the mean over all pixels, by hand."""
     alpha = torch.zeros(480, 640)
     alpha[100:200, 300:400] = 1
     view = TrainingView(None, torch.zeros(480, 640, 3), alpha=alpha)
-    empty = EmptyOpacity(0.5).needs(view, None)["empty"]
+    certain = CertainOpacity(0.5).needs(view, None)["certain"]
     expected = torch.ones(480, 640)
     expected[96:204, 296:404] = 0
-    assert torch.equal(empty, expected)
-    inputs = LossInputs({"alpha": torch.full((480, 640), 0.2)}, Target(view.image, None, {"empty": empty}), None, None, None)
-    assert float(EmptyOpacity(0.5)(inputs)) == pytest.approx(0.5 * 0.2 * (1 - 108 * 108 / (480 * 640)), rel=1e-5)
+    expected[104:196, 304:396] = -INSIDE
+    assert torch.equal(certain, expected)
+    outputs, target = {"alpha": torch.full((480, 640), 0.2)}, Target(view.image, None, {"certain": certain})
+    inputs, term = LossInputs(outputs, target, None, None, None), CertainOpacity(0.5)
+    both = 0.2 * (480 * 640 - 108 * 108) + 0.8 * INSIDE * 92 * 92
+    assert float(term(inputs)) == pytest.approx(0.5 * both / (480 * 640), rel=1e-5)
     mask = torch.zeros(480, 640)
     mask[:, :300] = 1  # 4 columns of it are near the object
-    masked = dataclasses.replace(inputs, target=dataclasses.replace(inputs.target, mask=mask))
-    assert float(EmptyOpacity(0.5)(masked)) == pytest.approx(0.5 * 0.2 * (1 - 4 * 108 / (480 * 300)), rel=1e-5)
-    assert not EmptyOpacity().needs(dataclasses.replace(view, alpha=None), None)["empty"].any()
+    masked = dataclasses.replace(inputs, target=dataclasses.replace(target, mask=mask))
+    assert float(term(masked)) == pytest.approx(0.5 * 0.2 * (1 - 4 * 108 / (480 * 300)), rel=1e-5)
+    assert not term.needs(dataclasses.replace(view, alpha=None), None)["certain"].any()
 
 
 @pytest.mark.parametrize(
@@ -496,7 +499,7 @@ def test_opaque_views_have_no_shift_and_an_estimated_opacity_is_a_target_only_wh
     """An estimated one says where Gaussians start and are sampled; alpha_weight 0 leaves the loss of opaque views."""
     assert fitted(cutouts(), LossConfig(), 0).settings(5)[SHIFT] != (0, 0, 0)
     estimated = {"alpha_estimated": True}
-    for change, weight, more in (({"alpha": None}, 1, []), (estimated, 0, []), (estimated, 1, ["empty"])):
+    for change, weight, more in (({"alpha": None}, 1, []), (estimated, 0, []), (estimated, 1, ["certain"])):
         fit = fitted([dataclasses.replace(v, **change) for v in cutouts()], LossConfig(alpha_weight=weight), 1)
         assert [t.name for t in fit.terms] == ["photometric", *more] and fit.settings(5)[SHIFT] == (0, 0, 0)
     assert fit.views[0].countable is not None and fit.layout.sizes.cutout

@@ -276,36 +276,43 @@ def _map_bytes(sizes: StepSizes, channels: int, maps: int) -> Needs:
     return {**dict.fromkeys(STEP, copy), LOSS: copy + maps * FLOAT * sizes.pixels}
 
 
-EMPTY_WEIGHT = 0.3
-"""Weight of `EmptyOpacity`, as a fraction of that of `AlphaDifference` (docs/decisions/034-objects-on-black.md)."""
+CERTAIN_WEIGHT, INSIDE = 1.0, 0.1
+"""Weight of `CertainOpacity`, as a fraction of that of `AlphaDifference`, and that of pixels inside the object as a fraction of
+it (docs/decisions/034-objects-on-black.md)."""
 AWAY = 0.005
-"""Least distance from the object at which a pixel is empty for certain, as a fraction of the image's diagonal."""
+"""Least distance from the edge of the object at which a pixel is empty or opaque for certain, as a fraction of the image's
+diagonal."""
 
 
-@register("empty")
+@register("certain")
 @dataclass(frozen=True)
-class EmptyOpacity(LossTerm, group="empty."):
-    """The weighted mean opacity where photographs of an object on black are empty, which black haze would hide."""
+class CertainOpacity(LossTerm, group="certain."):
+    """The weighted mean absolute difference of opacity where photographs of an object on black leave no doubt.
+
+    Black haze beside the object, and too bright colours of a transparent object, would look the same in these photographs.
+    """
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha",)
-    weight: Weight = EMPTY_WEIGHT
+    weight: Weight = CERTAIN_WEIGHT
     """Weight of the term, in [0, 1000]."""
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, Tensor]:
-        """Return 1 for pixels at least `AWAY` from the object, 0 for others and without an opacity, shape [H, W]."""
+        """Return 1 for empty pixels at least `AWAY` from the object, -`INSIDE` as far inside, else 0, shape [H, W]."""
         if view.alpha is None:
-            return {"empty": torch.zeros_like(view.image[..., 0])}
+            return {"certain": torch.zeros_like(view.image[..., 0])}
         reach = max(1, round(AWAY * math.hypot(*view.alpha.shape)))
-        near = torch.nn.functional.max_pool2d((view.alpha > 0)[None, None].to(view.alpha.dtype), 2 * reach + 1, 1, reach)
-        return {"empty": 1 - near[0, 0]}
+        sides = torch.stack([view.alpha > 0, view.alpha < 1])[:, None].to(view.alpha.dtype)
+        outside, inside = 1 - torch.nn.functional.max_pool2d(sides, 2 * reach + 1, 1, reach)[:, 0]
+        return {"certain": outside - INSIDE * inside}
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes of the products and a gradient, and of the copy of the map on CUDA."""
-        return _map_bytes(sizes, 1, 2 + sizes.masked)
+        """Return the bytes of the products, the constant part and a gradient, and of the copy of the map on CUDA."""
+        return _map_bytes(sizes, 1, 4 + sizes.masked)
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        """Compute ``weight`` times the sum of opacities of empty pixels, divided by the number of unmasked pixels, shape []."""
-        return _weighted_mean(inputs.outputs["alpha"] * inputs.target.maps["empty"], inputs.target.mask, self.weight)
+        """Compute ``weight`` times the sum of weighted differences, divided by the number of unmasked pixels, shape []."""
+        sign = inputs.target.maps["certain"]
+        return _weighted_mean(sign * inputs.outputs["alpha"] + (-sign).clamp_min(0), inputs.target.mask, self.weight)
 
 
 # Loss terms for given depth and normals, for views that have them.
@@ -474,7 +481,7 @@ def built_in_terms(
     """
     terms: list[tuple[bool, Callable[[float], LossTerm], float]] = [
         (cutout, AlphaDifference, config.alpha_weight),
-        (black and not cutout, EmptyOpacity, EMPTY_WEIGHT * config.alpha_weight),
+        (black and not cutout, CertainOpacity, CERTAIN_WEIGHT * config.alpha_weight),
         (True, SmoothDepth, config.smooth_weight or 0.0),
         (depth, GivenDepthDifference, config.depth_weight),
         (normals, GivenNormalsDifference, config.normal_weight),
