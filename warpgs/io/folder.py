@@ -493,7 +493,6 @@ class ViewList:
         self._done: Counter[str] = Counter()
         self._kept: dict[str, float] = {}
         self._narrow: dict[str, float] = {}
-        self._specks: list[str] = []
         self._names: set[str] = set()
 
     def claim(self, name: str, where: str) -> str:
@@ -531,7 +530,9 @@ class ViewList:
         clear = [0.0 if v.alpha is None else float(1 - v.alpha.mean()) for v in self._views]
         share, many = math.fsum(clear) / max(1, len(clear)), sum(c > 0 for c in clear)
         if many and "cut out by a mask file" not in self._done and (share < MIN_CUT or many < MIN_CUT_VIEWS * len(clear)):
-            self._specks = [f"their transparent pixels, {share:.2%} of all, do not count, like masked ones: no cut-out object"]
+            self._done[f"without a cut-out object: transparent pixels, {share:.2%} of all, do not count, like masked ones"] = (
+                many
+            )
             self._views = [v if v.alpha is None else _masked_by_alpha(v, v.alpha) for v in self._views]
 
     def _append(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
@@ -552,7 +553,7 @@ class ViewList:
     def notes(self, options: ReadOptions | None = None) -> list[str]:
         """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
         self._load()
-        notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())] + self._specks
+        notes = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
         if 0 < (opaque := sum(v.alpha is None for v in self._views)) < len(self._views):
             notes.append(f"{opaque} of {len(self._views)} images have no transparent pixel, and count as opaque everywhere")
         if self._narrow:

@@ -129,8 +129,6 @@ def check_photos(views: Sequence[View], stopped: Callable[[], bool] = lambda: Fa
 
 def _check(name: str, differences: list[np.ndarray], *matches: int) -> PhotoCheck:
     """Return the check of a photograph from its differences to others, as `_difference` gives them, and numbers of matches."""
-    if not differences:
-        return PhotoCheck(name, 0, *matches, None, None, None)
     detail, *colors = (_typical([float(d[k]) for d in differences]) for k in range(4))
     factor = None if detail is None else round(math.exp(detail), 3)
     if len(known := [c for c in colors if c is not None]) < 3:
