@@ -172,7 +172,8 @@ def render(
     plan = film.plan_film(stored, path, settings)
     training: list[View] | bool = coverage
     alone, one_size = film.check_plan(plan, out, coverage, sheet)
-    if one_size and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
+    told = not alone and any(p.is_file() for p in (out / film.FILM, *home.glob(f"path-*/{film.FILM}")))
+    if one_size and not told and (not alone or out.suffix.lower() == ".mp4") and h264_encoder() is None:
         say(VP9)
     if coverage:
         try:
