@@ -530,9 +530,8 @@ class ViewList:
         clear = [0.0 if v.alpha is None else float(1 - v.alpha.mean()) for v in self._views]
         share, many = math.fsum(clear) / max(1, len(clear)), sum(c > 0 for c in clear)
         if many and "cut out by a mask file" not in self._done and (share < MIN_CUT or many < MIN_CUT_VIEWS * len(clear)):
-            self._done[f"without a cut-out object: transparent pixels, {share:.2%} of all, do not count, like masked ones"] = (
-                many
-            )
+            what = f"without a cut-out object: transparent pixels, {share:.2%} of all, do not count, like masked ones"
+            self._done[what] = many
             self._views = [v if v.alpha is None else _masked_by_alpha(v, v.alpha) for v in self._views]
 
     def _append(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:

@@ -155,10 +155,8 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
     notes: list[str] = [Task(f"{what}: {listed(named, MAX_NAMED)}; {remedy}") for what, remedy, named in faults if named]
     tried, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
     if tried >= 2 * MIN_TRIED and agreeing < MIN_AGREEMENT * tried:  # both photographs count a match
-        words = (
-            f"the cameras do not fit the photographs: only {agreeing / tried:.0%} of {tried // 2:,} matches agree with them; "
-        )
-        words += "check that poses have the direction (from camera to world, or back) and axes of the format"
-        return [Task(f"{words}, and that focal lengths are in pixels"), *notes]
+        share = f"only {agreeing / tried:.0%} of {tried // 2:,} matches agree with them"
+        remedy = "check direction (from camera to world, or back) and axes of poses, and that focal lengths are in pixels"
+        return [Task(f"the cameras do not fit the photographs: {share}; {remedy}"), *notes]
     alone = [c.name for c in checks if not c.compared_with]
     return [*notes, *([f"blur and exposure not checked, too few matches: {listed(alone, MAX_NAMED)}"] if alone else [])]

@@ -465,13 +465,10 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     Raises:
         DataError: The file is missing, damaged, or not a model.
     """
-    path = Path(path)
-    tensors, header, _ = read_tensors(
-        path, "check the path and its permissions", "write it again with warpgs.save, or read PLY with warpgs.read_ply"
-    )
+    path, fix = Path(path), "write it again with warpgs.save, or read PLY with warpgs.read_ply"
+    tensors, header, _ = read_tensors(path, "check the path and its permissions", fix)
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
-        raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
-    fix = "write it again with warpgs.save"
+        raise DataError(f"{path}: not a model of format {FORMAT}; {fix}")
     with explained(f"{path}: its header is damaged", fix, (KeyError, ValueError, UsageError)):
         units, names = header["units"], header.keys() - {"format", "version", "units"}
         SIMILARITY(similarity := {n: schema.parse(header[n]) for n in names}, "normalization")
