@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -705,20 +706,16 @@ def probe_seconds(width: int, height: int, device: torch.device) -> float:
     Returns the median of `REPEATS`; takes some hundred milliseconds.
     """
     count = max(1, width * height // PIXELS_PER_GAUSSIAN)
-    real = {"dtype": torch.float32, "device": "cpu"}
-    sampled = real | {"generator": torch.Generator().manual_seed(0)}
-    depth = 2 + 4 * torch.rand(count, 1, **sampled)
-    across = torch.rand(count, 2, **sampled) - 0.5
-    means = torch.cat([across * depth * torch.tensor([1.0, height / width], **real), depth], 1)
-    tensors = {
-        "means": means, "quats": torch.randn(count, 4, **sampled),
-        "log_scales": torch.log(depth / width * (1 + 2 * torch.rand(count, 3, **sampled))),
-        "logit_opacities": torch.randn(count, **sampled), "sh": 0.3 * torch.randn(count, 4, 3, **sampled),
-    }  # fmt: skip
-    gaussians = Gaussians(**{n: t.to(device).requires_grad_() for n, t in tensors.items()})
+    real, generator = {"dtype": torch.float32, "device": "cpu"}, torch.Generator().manual_seed(0)
+    rand, randn = (functools.partial(f, generator=generator, **real) for f in (torch.rand, torch.randn))
+    depth = 2 + 4 * rand(count, 1)
+    means = torch.cat([(rand(count, 2) - 0.5) * depth * torch.tensor([1.0, height / width], **real), depth], 1)
+    log_scales = torch.log(depth / width * (1 + 2 * rand(count, 3)))
+    tensors = means, randn(count, 4), log_scales, randn(count), 0.3 * randn(count, 4, 3)
+    gaussians = Gaussians(*(t.to(device).requires_grad_() for t in tensors))
     K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]], **real)
     camera = Camera(torch.eye(4, **real).to(device), K.to(device), width, height)
-    target = torch.rand(height, width, 3, **sampled).to(device)
+    target = rand(height, width, 3).to(device)
     seconds = []
     for _ in range(REPEATS + 1):
         began = time.perf_counter()
