@@ -358,6 +358,9 @@ def value(config: FitConfig, name: str):
         *((n, OPAQUE, "cuda", {}, {"steps": most}) for n, most in ((9, 5511), (12, 6839), (54, 12_481), (1000, 30_000))),
         *((n, OPAQUE, d, {}, {GAIN: gain}) for n in (3, 12) for d, gain in (("cpu", 0.0), ("cuda", 0.1))),
         (12, OPAQUE, "cpu", {"steps": 100}, {GAIN: 0.1, "sh_every": 500}),
+        # nor for objects on black, whose blocks are mostly empty
+        *((n, v, "cuda", {}, {GAIN: gain}) for n in (3, 12) for v, gain in ((ESTIMATED, 0.0), (CUT, 0.1))),
+        (12, ESTIMATED, "cuda", {"stopping_min_gain_db": 0.1}, {GAIN: 0.1}),
         # nor where views have half size until growth ends, since nothing could end it
         *((n, OPAQUE, "cuda", {"preset": "quick"}, {GAIN: 0.0, "sh_every": every}) for n, every in ((3, 500), (40, 20))),
         # from ten views on, a fifth of the steps has half size, fewer where the time of a CPU limits them

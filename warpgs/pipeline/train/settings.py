@@ -519,7 +519,7 @@ AVERAGED_VIEWS = 20
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
 too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md); nor if views have half
-size until growth ends anyway."""
+size until growth ends anyway, nor for objects on black, whose blocks are mostly empty."""
 CPU_SECONDS = 3.0, 5.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
 CPU_TIMES = 0.002, 6.8e-8, 3.3e-7, 1.3e-8
@@ -657,7 +657,8 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     limited = steps < wanted
     half = half if limited else given(config.half_resolution, max(LEAST_HALF, half))
     phases = plan_phases(config.phases, steps)
-    whole = limited or half * steps >= phases.stable_start  # a fit that nothing can end early holds nothing out
+    black = any(v.alpha_estimated for v in train)
+    whole = limited or black or half * steps >= phases.stable_start  # a fit that nothing can end early holds nothing out
     init, stopping = config.init, config.stopping
     if init.extrapolate is None:
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)

@@ -132,7 +132,7 @@ class StoppingConfig(Checked, group="stopping."):
     """Growth, the phase that adds Gaussians, ends when the gain of the left-out blocks over at least the last third of the
     steps, plus its standard error, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does not end
     in its first third, nor while views have half size. 0: no blocks are left out, and the fit takes the planned steps. None:
-    0.1, or 0 if --cpu-limit shortens the fit, or if views have half size until growth ends, as with quick."""
+    0.1; or 0 if --cpu-limit shortens the fit, for objects on black, or if views have half size until growth ends (quick)."""
 
 
 _COUNT = whole(0)
