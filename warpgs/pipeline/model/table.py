@@ -446,11 +446,11 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
         ValueError: The shapes of the tensors do not match.
     """
     where = f"{path}: not written"
-    if (suffix := Path(path).suffix.lower()) in (".ply", ".spz", ".sog", ".splat", ".ksplat"):
-        raise UsageError(f"{where}: this writes safetensors, not {suffix}; use warpgs.write_ply, or `warpgs export`")
     _check_values(gaussians, where)
     normalization = checked_normalization(normalization, units, where)
     similarity = {name: json.dumps(value) for name, value in similarity_values(normalization).items()}
+    if (suffix := Path(path).suffix.lower()) in (".ply", ".spz", ".sog", ".splat", ".ksplat"):
+        raise UsageError(f"{where}: this writes safetensors, not {suffix}; use warpgs.write_ply, or `warpgs export`")
     header = {"format": FORMAT, "version": __version__, "units": units} | similarity
     write_bytes(Path(path), *tensor_pieces(gaussians.tensors(), header))
 
