@@ -121,7 +121,7 @@ def test_mistakes_are_named(tmp_path):
 def test_only_stored_gaussians_are_written(tmp_path, write):
     means, quats, scales = torch.rand(2, 3), torch.rand(2, 4), torch.rand(2, 3)
     activated = warpgs.ActivatedGaussians(means, quats, scales, torch.full((2,), 0.5))
-    path = tmp_path / "scene.ply"
+    path = tmp_path / f"scene{'.safetensors' if write is warpgs.save else '.ply'}"
     with pytest.raises(TypeError, match=r"not ActivatedGaussians; give gaussians\.stored\(\)"):
         write(path, activated, units="file")
     covariances = warpgs.CovarianceGaussians(means, torch.eye(3).repeat(2, 1, 1), torch.full((2,), 0.5))
