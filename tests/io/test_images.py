@@ -293,7 +293,7 @@ def test_alpha_arrives_in_every_format(write, tmp_path):
     assert fingerprint([first]) != fingerprint([dataclasses.replace(first, alpha=other)])
 
 
-@pytest.mark.parametrize(("count", "clear", "object_"), [(1, 6, False), (5, 1, False), (5, 6, True), (2, 6, False)])
+@pytest.mark.parametrize(("count", "clear", "object_"), [(1, 6, False), (5, 1, False), (5, 6, True), (2, 10, False)])
 def test_a_few_transparent_pixels_are_masked_and_make_no_object(count, clear, object_, tmp_path):
     """A speck in one photograph, or one cut-out photograph among others, does not change how the scene is fitted."""
     scenes.write_transforms(tmp_path)
