@@ -311,6 +311,20 @@ def test_a_few_transparent_pixels_are_masked_and_make_no_object(count, clear, ob
         assert not any("count as opaque" in note for note in scene.notes)
 
 
+def test_images_that_are_hardly_transparent_keep_their_pixels(tmp_path):
+    """As a lossy encoder leaves an alpha of 253 everywhere; one that is wholly transparent among opaque ones is left out."""
+    scenes.write_transforms(tmp_path)
+    for i in range(4):
+        scenes.save(tmp_path / "images" / f"photo{i}.png", rgba(i, np.full((12, 16), 253, np.uint8)))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 5 and all(v.alpha is None and (v.mask is None or v.mask.all()) for v in scene.views)
+    for i in range(4):
+        scenes.save(tmp_path / "images" / f"photo{i}.png", rgba(i, np.full((12, 16), 255 * (i > 0), np.uint8)))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4 and all(v.alpha is None and v.mask is None for v in scene.views)
+    assert "1 image wholly transparent, showing nothing" in scene.notes
+
+
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.5, 0.25)])
 def test_transparent_colours_do_not_run_into_others(background, tmp_path):
     """Resampling is a mean over what can be seen: the red of transparent pixels leaves no trace."""

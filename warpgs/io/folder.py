@@ -474,8 +474,8 @@ def loaders() -> int:
 
 
 def _masked_by_alpha(view: View, alpha: np.ndarray) -> View:
-    """Return a view whose transparent pixels are masked, also those that are transparent in part."""
-    mask = alpha > 1 - 1e-3  # a mean of ones may be rounded
+    """Return a view whose pixels are masked where its opacity is below 1 - `MIN_CUT`."""
+    mask = alpha > 1 - MIN_CUT  # lossy encoders leave 253 of 255
     return replace(view, mask=mask if view.mask is None else mask & view.mask, alpha=None)
 
 
@@ -532,7 +532,8 @@ class ViewList:
         if many and "cut out by a mask file" not in self._done and (share < MIN_CUT or many < MIN_CUT_VIEWS * len(clear)):
             what = f"without a cut-out object: transparent pixels, {share:.2%} of all, do not count, like masked ones"
             self._done[what] = many
-            self._views = [v if v.alpha is None else _masked_by_alpha(v, v.alpha) for v in self._views]
+            masked = (v if v.alpha is None else _masked_by_alpha(v, v.alpha) for v in self._views)
+            self._views = [v for v in masked if v.mask is None or v.mask.any()]
 
     def _append(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         if loaded.kept is not None:

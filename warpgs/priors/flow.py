@@ -246,7 +246,7 @@ def _ratio_matches(first: np.ndarray | None, second: np.ndarray | None, device: 
 def agreeing_matches(
     a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE, device: torch.device = CPU
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Match two views' features; return rows [N, 2] and points [N, 3] [u] of matches that agree with the poses, of how many."""
+    """Match two views' features; return rows [N, 2] and points [N, 3] [u] of those that agree with the poses; number of all."""
     ids = _ratio_matches(first[1], second[1], device)
     found, good = _triangulate(a, b, first[0][ids[:, 0]], second[0][ids[:, 1]], min_angle)
     return ids[good], found[good], len(ids)

@@ -519,7 +519,7 @@ AVERAGED_VIEWS = 20
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
 too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md); nor if views have half
-size until growth ends anyway, nor for objects on black, whose blocks are mostly empty."""
+size until growth ends. Blocks of objects on black are mostly empty, so none are held out."""
 CPU_SECONDS = 3.0, 5.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
 CPU_TIMES = 0.002, 6.8e-8, 3.3e-7, 1.3e-8
