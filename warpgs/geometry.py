@@ -491,7 +491,8 @@ def pose_at(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return camera_from_world [4, 4] of a camera at ``center`` that looks at ``target`` with ``up`` (all [3]) upwards."""
     center, target, up = (np.asarray(v, float) for v in (center, target, up))
-    z = (target - center) / np.linalg.norm(target - center)
+    with np.errstate(invalid="ignore"):  # NaN if target is the center
+        z = (target - center) / np.linalg.norm(target - center)
     x = np.cross(-up, z)
     if not np.linalg.norm(x) > 0:
         raise UsageError("look_at: up and the view must not be parallel, and target must not be the center")

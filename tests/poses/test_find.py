@@ -117,7 +117,7 @@ def test_photographs_that_cannot_work(sfm, tmp_path, capsys, kind, count, messag
     for i in range(count):
         noise(source / f"{i}.png", i)
         if kind == "blank":
-            write_png(source / f"{i}.png", np.full((120, 160, 3), 200, np.uint8))
+            write_png(source / f"{i}.png", np.full((120, 160, 3), 200 + i, np.uint8))
     if kind == "broken":
         (source / "1.png").write_bytes((source / "1.png").read_bytes()[:500])
     assert main(["poses", str(source), "--out", str(tmp_path / "out")]) == DataError.exit_code
@@ -143,6 +143,17 @@ def test_photographs_of_an_unread_format_are_named(sfm, tmp_path, capsys, comman
     said = capsys.readouterr().err.splitlines()[-1]
     assert "has 2 photographs" in said and "left out: a.nef is a RAW" in said
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
+
+
+def test_a_copy_is_no_photograph_more(sfm, tmp_path, capsys):
+    """It would raise the count, and a held-out copy would be scored as if it were a new view."""
+    source = tmp_path / "in"
+    source.mkdir()
+    for i in range(2):
+        noise(source / f"{i}.png", i)
+    (source / "0 (1).png").write_bytes((source / "0.png").read_bytes())
+    assert main(["poses", str(source), "--out", str(tmp_path / "out")]) == DataError.exit_code
+    assert "has 2 photographs; left out: 0.png is a copy of 0 (1).png; poses need" in capsys.readouterr().err
 
 
 def test_videos_that_cannot_work(sfm, tmp_path, capfd):

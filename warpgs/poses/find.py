@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpgs import files, schema
-from warpgs.errors import DataError, UsageError, explained
+from warpgs.errors import DataError, UsageError, explained, listed
 from warpgs.io.folder import all_readers, loaders
 from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses import photographs as photos
@@ -292,6 +292,15 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
 
 
+def _distinct(paths: Sequence[Path]) -> tuple[list[Path], str]:
+    """Return image files without copies of earlier ones, and a note on the copies; held out, they would score too well."""
+    equal: dict[str, list[Path]] = {}
+    for path in paths:
+        equal.setdefault(files.input_digest(path), []).append(path)
+    copies = [f"{copy.name} is a copy of {first.name}" for first, *others in equal.values() for copy in others]
+    return [first for first, *_ in equal.values()], listed(copies, photos.SHOWN_FOLDERS)
+
+
 def _prepared(
     source: Path, work: Path, frames: int, max_pixels: int, progress: Say
 ) -> tuple[list[photos.Photograph], list[str], list[str]]:
@@ -306,7 +315,8 @@ def _prepared(
     root = photos.image_root(root)
     (paths, about), unread = photos.find_photographs(root), unread_note(root)
     notes += about
-    if unread:
+    paths, copies = _distinct(paths)
+    if unread := "; ".join(filter(None, (unread, copies))):
         notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:
         what = "frame" if photos.is_video(source) else "photograph"

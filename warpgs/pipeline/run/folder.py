@@ -239,6 +239,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     fix = "give a folder that `warpgs fit --out` filled"
     if not os.path.lexists(path):
         lack = f"not the folder of a run ({CONFIG} is missing)" if folder.exists() else "no such folder"
+        if (folder / "scene" / "poses.json").is_file():
+            lack, fix = "a fit saved only poses here, and no step", "give its whole command again, with the photographs"
         raise DataError(f"{folder}: {lack}; {(not folder.exists() and similar_folder(folder)) or fix}")
     with explained(f"{path}: not a record of a fit", fix, (OSError, ValueError)):
         record: dict[str, Any] = schema.read(path, folder)
