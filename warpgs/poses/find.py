@@ -293,12 +293,14 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
 
 
 def _distinct(paths: Sequence[Path]) -> tuple[list[Path], str]:
-    """Return image files without copies of earlier ones, and a note on the copies; held out, they would score too well."""
+    """Return image files without copies of others, and a note on the copies; held out, they would score too well."""
     equal: dict[str, list[Path]] = {}
     for path in paths:
         equal.setdefault(files.input_digest(path), []).append(path)
-    copies = [f"{copy.name} is a copy of {first.name}" for first, *others in equal.values() for copy in others]
-    return [first for first, *_ in equal.values()], listed(copies, photos.SHOWN_FOLDERS)
+    # the shortest name is the first: systems add " (1)" or "copy"
+    first = {path: min(group, key=lambda p: len(p.name)) for group in equal.values() for path in group}
+    copies = [f"{p.name} is a copy of {first[p].name}" for p in paths if first[p] != p]
+    return [p for p in paths if first[p] == p], listed(copies, photos.SHOWN_FOLDERS)
 
 
 def _prepared(
