@@ -13,7 +13,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -107,23 +107,6 @@ def is_loopback(address: str) -> bool:
     """Return whether only this machine can reach a socket's address."""
     found = ipaddress.ip_address(address.partition("%")[0])
     return (getattr(found, "ipv4_mapped", None) or found).is_loopback
-
-
-class Allowance:
-    """Rate limit: a number of allowed messages that grows with time up to a maximum."""
-
-    def __init__(self, per_second: float, most: float, clock: Callable[[], float] = time.monotonic):
-        """Start with the largest number of messages."""
-        self._per_second, self._most, self._clock = per_second, most, clock
-        self._left, self._last = most, clock()
-
-    def take(self) -> bool:
-        """Take one message; return False if none is left."""
-        now = self._clock()
-        self._left, self._last = min(self._most, self._left + self._per_second * (now - self._last)), now
-        taken = self._left >= 1
-        self._left -= taken
-        return taken
 
 
 class WebGuard:

@@ -6,7 +6,7 @@ import pytest
 
 from warpgs import ranks
 from warpgs.errors import UsageError
-from warpgs.ranks import Allowance, WebGuard, listeners, loopback_interface, loopback_of, loopback_socket, say_what_is_open
+from warpgs.ranks import WebGuard, listeners, loopback_interface, loopback_of, loopback_socket, say_what_is_open
 
 OWN = "127.0.0.1:8080"
 
@@ -83,11 +83,3 @@ def test_what_others_can_reach_is_printed(capsys):
     assert "default-src 'none'" in policy and "script-src 'nonce-word' " in policy
     assert "script-src 'unsafe-inline'" not in policy
     assert "ws:" not in WebGuard.headers("example.org; script-src *", "word")["Content-Security-Policy"]
-    # an allowance is three at once, then one each half second
-    now = [0.0]
-    allowance = Allowance(2, 3, lambda: now[0])
-    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
-    now[0] = 0.5
-    assert [allowance.take(), allowance.take()] == [True, False]
-    now[0] = 1000
-    assert sum(allowance.take() for _ in range(9)) == 3

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from warpgs import schema
 from warpgs.errors import DataError, ResourceError, WarpgsError, expect, explained, install_extras
 from warpgs.process import Say, say
-from warpgs.ranks import HOST, Allowance, WebGuard, loopback_socket
+from warpgs.ranks import HOST, WebGuard, loopback_socket
 from warpgs.schema import Schema
 
 if TYPE_CHECKING:
@@ -216,14 +216,8 @@ def _limited(value: float, low: float | None, high: float | None) -> float:
     return min(max(value, -math.inf if low is None else low), math.inf if high is None else high)
 
 
-MAX_BROWSERS = 16
-"""Largest number of websockets at a time."""
 MAX_CONNECTIONS = 64
 """Largest number of connections at a time, including connections that have sent no request yet."""
-MESSAGES_PER_SECOND = 200.0
-"""Rate of messages of one browser; moving a camera sends 50 a second."""
-MAX_BURST = 2000.0
-"""Largest number of messages at once: a delayed page sends a burst."""
 REFUSED = "Open the address that the viewer printed.\n"
 _HOOK = threading.Lock()
 
@@ -262,8 +256,6 @@ class Rules:
         if path is None or (upgrade and headers.get_all("Sec-WebSocket-Protocol") != [protocol]):
             return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
         if upgrade:
-            if len(self.browsers) >= MAX_BROWSERS:
-                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "Too many browsers.\n")
             self.browsers.add(connection)
             return None
         if inner is None:
@@ -292,7 +284,6 @@ def connection_class(rules: Rules) -> type:
             super().__init__(*args, **named)
             self.nonce = secrets.token_urlsafe(16)
             self.refused = False
-            self.allowance = Allowance(MESSAGES_PER_SECOND, MAX_BURST)
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
@@ -312,8 +303,6 @@ def connection_class(rules: Rules) -> type:
                 if self.refused:  # messages from before the connection ended, too
                     continue
                 try:
-                    if not self.allowance.take():
-                        raise DataError(f"more than {MESSAGES_PER_SECOND:.0f} messages a second")
                     checked = rules.checked(frame)
                 except DataError as e:
                     self.refused = True
