@@ -1,5 +1,6 @@
 """Maps beside the photographs: depth, normals and masks that the user gives."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -7,9 +8,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError, UsageError, expect, explained
-from warpgs.files import PIECE, inside, open_input
+from warpgs.files import inside, read_input
 from warpgs.geometry import CENTRAL
-from warpgs.io.image_files import MAX_PIXELS, decode_png
+from warpgs.io.image_files import BYTES_PER_PIXEL, EXTRA_FILE_BYTES, MAX_PIXELS, decode_png
 from warpgs.io.images import LoadedImage, ReadOptions, turn_upright, undistortion_maps
 from warpgs.scene import GivenDepth, View
 
@@ -59,39 +60,20 @@ def _find(files: dict[str, Path], image: Path) -> tuple[Path | None, Path | None
     return None, None
 
 
-def mapped_array(path: Path, fix: str) -> np.memmap:
-    """Return the array of an NPY file, which stays in the file, for its shape and type alone; `array_numbers` reads it."""
-    # numpy compares the shape with the file's size
+def read_array(path: Path, most: int, fix: str) -> np.ndarray:
+    """Return the array of an NPY file of at most ``most`` bytes."""
     with explained(f"{path}: cannot be read as a numpy array", fix, Exception):  # numpy raises a dozen types
-        open_input(path).close()
-        found = np.load(path, mmap_mode="r", allow_pickle=False)
-    if not isinstance(found, np.memmap):
-        found.close()
+        found = np.load(io.BytesIO(read_input(path, most)), allow_pickle=False)
+    if not isinstance(found, np.ndarray):
         raise DataError(f"{path}: is an archive of arrays, not one array; {fix}")
     return found
-
-
-def array_numbers(path: Path, found: np.memmap, kind: type | np.dtype, fix: str) -> np.ndarray:
-    """Return the numbers of an array of `mapped_array` as ``kind``, read by pieces."""
-    # a read of mapped memory ends the process (SIGBUS) if the file has become shorter, or its disk fails
-    numbers = np.empty(found.shape, kind, order="C" if found.flags.c_contiguous else "F")
-    flat, size, step = numbers.reshape(-1, order="A"), found.dtype.itemsize, PIECE // found.dtype.itemsize
-    with explained(f"{path}: cannot be read as a numpy array", fix, (OSError, ValueError)), open_input(path) as file:
-        file.seek(found.offset)
-        for at in range(0, flat.size, step):
-            part = flat[at : at + step]
-            data = file.read(part.size * size)
-            expect(len(data) == part.size * size, "it has become shorter while it was read")
-            with np.errstate(over="ignore", invalid="ignore"):
-                part[:] = np.frombuffer(data, found.dtype)
-    return numbers
 
 
 def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C]."""
     if path.suffix.lower() != ".npy":
         return decode_png(path, max_pixels)
-    found = mapped_array(path, "save the map alone")
+    found = read_array(path, BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES, "save the map alone")
     if found.dtype.kind not in "fu" or found.dtype.itemsize > 8:
         raise DataError(f"{path}: its numbers are {found.dtype}; save float32, or uint16 in millimetres")
     while found.ndim > 2 and found.shape[0] == 1:
@@ -101,7 +83,8 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     if found.shape[0] * found.shape[1] > max_pixels:
         raise DataError(f"{path}: has more than {max_pixels:,} pixels; shrink it, or raise --max-pixels")
     native = found.dtype.newbyteorder("=")
-    return array_numbers(path, found, native if native in (np.uint8, np.uint16) else np.float32, "save the map alone")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return found.astype(native if native in (np.uint8, np.uint16) else np.float32)
 
 
 def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:

@@ -15,27 +15,25 @@ from warpgs.io import folder as scenes
 from warpgs.io.colmap import understood
 from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, register
 from warpgs.io.images import Lens, ReadOptions, list_images
-from warpgs.io.maps import array_numbers, mapped_array
+from warpgs.io.maps import read_array
 from warpgs.scene import Scene
 
 IN_ORDER = "They are matched in sorted order, so one file too many or too few would give all a wrong pose. Copy the scene again"
 """Why the numbers of cameras and images must be equal, for messages."""
+MAX_BYTES = 2**25
+"""Largest file of parameters that is read [bytes]."""
 
 # LLFF scenes: poses_bounds.npy, one row of 17 numbers per image in sorted-name order (Mildenhall et al. 2019).
 
 FILE = "poses_bounds.npy"
-MAX_ROWS = 1_000_000
-"""Largest number of images."""
 
 
 def read_poses_bounds(path: Path) -> np.ndarray:
     """Return the array of poses_bounds.npy, float64, shape [N, 17]."""
-    rows = mapped_array(path, "make it again")
+    rows = read_array(path, MAX_BYTES, "make it again")
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
-    if len(rows) > MAX_ROWS:
-        raise DataError(f"{path}: has {len(rows):,} rows; at most {MAX_ROWS:,} are supported. Make it again")
-    return array_numbers(path, rows, np.float64, "make it again")
+    return rows.astype(np.float64)
 
 
 @register("llff")
@@ -197,9 +195,6 @@ class DTUReader(Reader):
 
 
 # Middlebury multi-view scenes: `*_par.txt`, a line per image with K, R and t (Seitz et al. 2006).
-
-MAX_BYTES = 2**25
-"""Largest file of parameters that is read [bytes]."""
 
 
 def files_of(root: Path) -> list[Path]:
