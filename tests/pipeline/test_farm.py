@@ -306,7 +306,7 @@ def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monke
         monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
         (tmp_path / "torch.py").write_text("raise SystemExit('planted')")
         monkeypatch.chdir(tmp_path)
-        engine = SlurmEngine("cpu", 2, folder=tmp_path / "private")
+        engine = SlurmEngine("cpu", 2, 1, 240, None, tmp_path / "private")
     try:
         statuses = run_farm(jobs, engine)
     finally:
@@ -454,7 +454,7 @@ def test_pickles_planted_in_the_results_are_never_loaded(cluster, job, tmp_path)
     folder.mkdir(parents=True)
     for name in ("70_0_result.pkl", "70_submitted.pkl"):
         (folder / name).write_bytes(pickle.dumps(("success", Planted(mark))))
-    engine = SlurmEngine("cpu", 1)
+    engine = SlurmEngine("cpu", 1, 1, 240, None, None)
     start = engine.start
 
     def begin(job):
@@ -471,7 +471,7 @@ def test_pickles_planted_in_the_results_are_never_loaded(cluster, job, tmp_path)
 
 @with_slurm
 def test_a_job_goes_to_its_node_as_json_in_a_private_folder(cluster, job, tmp_path):
-    engine = SlurmEngine("cuda", None, 3, 90, "gpu")
+    engine = SlurmEngine("cuda", None, 3, 90, "gpu", None)
     assert engine.slots == 100
     engine.start(job)
     ((program, *options),) = cluster.calls
@@ -516,7 +516,7 @@ def test_a_folder_that_others_can_write_to_is_refused(cluster, tmp_path):
 @with_slurm
 def test_each_end_of_a_job_is_an_event_and_what_slurm_refuses_is_said(cluster, job, capsys, monkeypatch):
     """An answer; none, once Slurm has not listed the job three times; where Slurm does not answer, nothing is known."""
-    engine = SlurmEngine("cpu", 1)
+    engine = SlurmEngine("cpu", 1, 1, 240, None, None)
     for number, state in enumerate(("done", "failed", "held"), 70):
         engine.start(job)
         assert engine.wait(0) == []
@@ -533,7 +533,7 @@ def test_each_end_of_a_job_is_an_event_and_what_slurm_refuses_is_said(cluster, j
     ((_, state, reason),) = engine.wait(0)
     assert state == "crashed" and "73 ended without an answer: error: *** JOB 73 CANCELLED DUE" in reason
     engine.close()
-    engine = SlurmEngine("cpu", 1)
+    engine = SlurmEngine("cpu", 1, 1, 240, None, None)
     cluster.fail["sbatch"] = "sbatch: error: invalid partition specified: nope\n"
     with pytest.raises(ResourceError, match="rejected job s0: sbatch: error: invalid partition"):
         engine.start(job)
@@ -544,7 +544,7 @@ def test_each_end_of_a_job_is_an_event_and_what_slurm_refuses_is_said(cluster, j
     assert "jobs may still run: no permission" in capsys.readouterr().err
     monkeypatch.setattr(slurm.shutil, "which", lambda name: None)
     with pytest.raises(UsageError, match="needs Slurm's sbatch, squeue, scancel"):
-        SlurmEngine("cpu", 1)
+        SlurmEngine("cpu", 1, 1, 240, None, None)
 
 
 @with_slurm

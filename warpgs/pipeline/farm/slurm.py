@@ -42,15 +42,7 @@ class SlurmEngine:
 
     name = "slurm"
 
-    def __init__(
-        self,
-        device: str,
-        slots: int | None,
-        threads: int = 1,
-        minutes: int = 240,
-        partition: str | None = None,
-        folder: Path | None = None,
-    ):
+    def __init__(self, device: str, slots: int | None, threads: int, minutes: int, partition: str | None, folder: Path | None):
         """Look for Slurm, and make a private folder."""
         if missing := [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]:
             raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: run warpgs on a machine of the cluster")

@@ -87,6 +87,7 @@ VARIANTS = {
     "psnr": "of images rounded to 8 bits, over the scored pixels alone; mean over images",
     "ssim": "as in 3DGS papers: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
     "ssim_skimage": "scikit-image, as in NeRF papers: the same window, without the border; about 0.005 lower",
+    "masks": "where a view has a mask, SSIM and LPIPS compare both images with white outside of it",
 }
 """Definition of PSNR and SSIM, for result files and reports. Scores by other definitions are not comparable."""
 ALPHA_VARIANTS = {
@@ -98,8 +99,6 @@ ALPHA_VARIANTS = {
 """Definition of each score of views with an alpha channel. A mean covers only the views with pixels for the score."""
 EMPTY, HALF, OBJECT = 0.02, 0.5, 0.98
 """Opacity below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
-MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
-NO_LPIPS = "not measured: no --lpips-weights were given"
 
 
 @dataclass(frozen=True)
@@ -316,8 +315,8 @@ def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
 
 def variants(lpips: Lpips | None, alpha: bool = False) -> dict[str, str]:
     """Return the definition of each score, with those of `ALPHA_VARIANTS` if ``alpha``, and how masks are used."""
-    networks = {"lpips": NO_LPIPS} if lpips is None else lpips.variants()
-    return VARIANTS | {"masks": MASKED} | networks | (ALPHA_VARIANTS if alpha else {})
+    networks = {"lpips": "not measured: no --lpips-weights were given"} if lpips is None else lpips.variants()
+    return VARIANTS | networks | (ALPHA_VARIANTS if alpha else {})
 
 
 MATCHED_RULE = "over the right half of each view, after an affine colour map fitted to its left half"

@@ -55,12 +55,7 @@ RULE = "inria"
 
 
 def open_file(
-    path: Path,
-    cameras: Path | None,
-    rule: str | None = None,
-    device: str = "auto",
-    antialiased: bool = False,
-    near: float | None = None,
+    path: Path, cameras: Path | None, rule: str | None, device: str, antialiased: bool = False, near: float | None = None
 ) -> tuple[FittedModel, list[str]]:
     """Read a file of Gaussians, and cameras from a file or a scene folder; returns model and notes.
 
@@ -345,8 +340,6 @@ def clean(
     ]
 
 
-PLOT = "plot.png"
-"""Values of the flags of a plot."""
 SIZES = (64, 8192)
 """Smallest and largest side of a plot [px]."""
 POINT_SIZE = 1e-3
@@ -379,7 +372,7 @@ def plot(
     background: str = "white", size: tuple[int, int] = (1600, 1000), cameras: bool = True,
 ) -> list[str]:  # fmt: skip
     """Write a plot of a run as PNG, with the options of `warpgs plot`; returns lines for the user."""
-    start, by_coverage, out = points == "start", color == "coverage", folder / PLOT if out is None else out
+    start, by_coverage, out = points == "start", color == "coverage", folder / "plot.png" if out is None else out
     with explained(f"{out}: not drawn", "change that flag", ValueError, UsageError):
         expect(all(SIZES[0] <= s <= SIZES[1] for s in size), f"each side of --size must have {SIZES[0]} to {SIZES[1]} px")
         expect(not (start and by_coverage), "--color coverage needs Gaussians, not --points start")

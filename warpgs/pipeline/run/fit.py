@@ -311,10 +311,6 @@ def pose_tasks(out: Path | None) -> list[str]:
     return [*map(Task, [left_out] * bool(lost) + [f"to photograph next: {a}" for a in advice])]
 
 
-COMPILING = "compiling kernels, once on this machine, for up to a minute"
-"""Message while kernels are compiled."""
-
-
 @dataclass(frozen=True, repr=False)
 class FitResult(FittedModel):
     """A finished fit."""
@@ -395,7 +391,7 @@ def fit(
         timed() as clock,
         folder as held,
         stages as progress,
-        told_of_compiling(lambda name: progress(COMPILING)) as compiled,
+        told_of_compiling(lambda name: progress("compiling kernels, once on this machine, for up to a minute")) as compiled,
         contextlib.ExitStack() as beside,
     ):
         resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
