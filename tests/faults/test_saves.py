@@ -317,17 +317,6 @@ def test_a_disk_that_fills(reference, disk, capfd, command, room):
     check_command(reference, command, work, before, capfd, lambda: disk("size=64m"))
 
 
-@pytest.mark.parametrize("command", ["fit", "render", "export", "prune"] if MANY else ["render"])
-@pytest.mark.parametrize("names", sizes(0, 1, 2, 3, 5, 8, 13))
-def test_a_disk_without_room_for_names(reference, disk, capfd, command, names):
-    work = disk("size=64m,nr_inodes=1000") / "work"
-    reference.before(command, work)
-    before = tiny_runs.digests(work)
-    there = os.statvfs(work)
-    disk(f"nr_inodes={there.f_files - there.f_ffree + names}")
-    check_command(reference, command, work, before, capfd, lambda: disk("nr_inodes=1000"))
-
-
 @pytest.mark.parametrize("command", ["fit", "resume", "render", "export", "convert", "mesh", "eval", "prune"])
 def test_a_disk_that_cannot_be_written(reference, disk, capfd, command):
     work = disk("size=64m") / "work"
