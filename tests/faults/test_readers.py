@@ -103,7 +103,7 @@ REASONS = {
     "pipeline/run/results.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
     "pipeline/study/study.py": {"_same_files": DIGEST},
     "plugins.py": {"module_digest": DIGEST},
-    "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST},
+    "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST, "_distinct": DIGEST},
     "poses/photographs.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE,
         "main": PIPE, "match": OWN, "extract": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN},

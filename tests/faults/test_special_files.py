@@ -152,8 +152,8 @@ def test_masks_of_a_scene(what, tmp_path):
 
 
 def test_photographs(tmp_path):
-    for name in "abc":
-        scenes.save(tmp_path / f"{name}.png", scenes.image(0))
+    for i, name in enumerate("abc"):
+        scenes.save(tmp_path / f"{name}.png", scenes.image(i))
     before = source_digest(tmp_path)
     for what in KINDS[:-1]:
         special(what, tmp_path / f"{what}.png")
