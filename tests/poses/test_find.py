@@ -151,9 +151,12 @@ def test_a_copy_is_no_photograph_more(sfm, tmp_path, capsys):
     source.mkdir()
     for i in range(2):
         noise(source / f"{i}.png", i)
-    (source / "0 (1).png").write_bytes((source / "0.png").read_bytes())
+    (source / "again").mkdir()
+    for copy in ("0 (1).png", "again/1.png"):
+        (source / copy).write_bytes((source / f"{copy.removeprefix('again/')[0]}.png").read_bytes())
     assert main(["poses", str(source), "--out", str(tmp_path / "out")]) == DataError.exit_code
-    assert "has 2 photographs; left out: 0 (1).png is a copy of 0.png; poses need" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "has 2 photographs; left out: 0 (1).png is a copy of 0.png, again/1.png is a copy of 1.png; poses need" in said
 
 
 def test_videos_that_cannot_work(sfm, tmp_path, capfd):

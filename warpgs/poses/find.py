@@ -292,14 +292,14 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
 
 
-def _distinct(paths: Sequence[Path]) -> tuple[list[Path], str]:
+def _distinct(paths: Sequence[Path], root: Path) -> tuple[list[Path], str]:
     """Return image files without copies of others, and a note on the copies; held out, they would score too well."""
     equal: dict[str, list[Path]] = {}
     for path in paths:
         equal.setdefault(files.input_digest(path), []).append(path)
     # the shortest name is the first: systems add " (1)" or "copy"
-    first = {path: min(group, key=lambda p: len(p.name)) for group in equal.values() for path in group}
-    copies = [f"{p.name} is a copy of {first[p].name}" for p in paths if first[p] != p]
+    first = {path: min(group, key=lambda p: len(str(p))) for group in equal.values() for path in group}
+    copies = [" is a copy of ".join(f.relative_to(root).as_posix() for f in (p, first[p])) for p in paths if first[p] != p]
     return [p for p in paths if first[p] == p], listed(copies, photos.SHOWN_FOLDERS)
 
 
@@ -317,7 +317,7 @@ def _prepared(
     root = photos.image_root(root)
     (paths, about), unread = photos.find_photographs(root), unread_note(root)
     notes += about
-    paths, copies = _distinct(paths)
+    paths, copies = _distinct(paths, root)
     if unread := "; ".join(filter(None, (unread, copies))):
         notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:
