@@ -197,6 +197,16 @@ def test_a_terminal_that_hangs_up(demo, tmp_path, monkeypatch):
 
 @with_sh
 @pytest.mark.slow
+@pytest.mark.parametrize("output", LOST)
+def test_a_fit_from_a_shell(demo, tmp_path, output):
+    """In a process as a shell starts it: code 0, and all files, whatever became of its words."""
+    code, said = shell(fit_words(demo, tmp_path / "run"), output, tmp_path)
+    assert code == 0 and (tmp_path / "run" / "report.html").is_file(), said
+    assert said == (f"warpgs: stdout cannot be written ({LOST[output]}){GOES_ON}" if LOST[output] else "")
+
+
+@with_sh
+@pytest.mark.slow
 def test_every_command_goes_on(demo, tmp_path, monkeypatch):
     """What is written to files is there, and stderr holds one line on the output; a table is a product, and is not."""
     shutil.copytree(demo, demo.parent / "scenes" / "s0")
