@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 import warpgs
 from tests.gaussians import LENSES, SMOOTH, camera, cloud, hand_placed, lens_camera
-from warpgs import Normalization, geometry, load, rasterize, read_ply, save, write_ply
+from warpgs import Normalization, export, geometry, load, rasterize, read_ply, save, write_ply
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import write_gaussians
 from warpgs.geometry import convert_camera, convert_gaussians, near_cameras
@@ -67,6 +67,9 @@ def test_model_and_ply_files_know_their_units(tmp_path, units):
         for found in (model.gaussians(wanted), read_ply(tmp_path / "m.ply", N, units=wanted)):
             for name, t in reference.tensors().items():
                 torch.testing.assert_close(getattr(found, name), t, rtol=1e-5, atol=1e-5, msg=name)
+    for read in (read_ply, export.read_gaussians):  # without units, a normalization is used
+        assert torch.equal(read(tmp_path / "m.ply", N).means, read_ply(tmp_path / "m.ply", N, units="scene").means)
+        assert torch.equal(read(tmp_path / "m.ply").means, read_ply(tmp_path / "m.ply", units="file").means)
     assert model.normalization.scale == N.scale and np.array_equal(model.normalization.offset, N.offset)
     torch.testing.assert_close(load(tmp_path / "m.safetensors").gaussians(units).means, given.means)
 

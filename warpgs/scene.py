@@ -698,6 +698,8 @@ def _value_fix(noun: str, real: bool, least: float, most: float, low: float, hig
         return f"estimate it again, or replace what is not finite: np.nan_to_num({noun}, posinf=0, neginf=0)"
     if high == 1 and most > (16 if real else 1):
         return f"divide by its full scale: {noun}.astype(np.float32) / {255 if most <= 256 else 65535}"
+    if (low, high) == (0, 1) and -1.001 <= least < -0.5:
+        return f"from [-1, 1] to [0, 1]: ({noun} + 1) / 2"
     if not real:
         return f"give floats: {noun}.astype(np.float32), in the unit of the cameras, or decoded from colours"
     return f"set missing values to 0: np.maximum({noun}, 0)" if high == MOST else f"clip it: np.clip({noun}, {low:g}, {high:g})"

@@ -67,6 +67,7 @@ IN_VIEWS = {
     "image uint16": (changed("view", image=(65535 * PIXELS).astype(np.uint16)), "image", "/ 65535"),
     "image 0..255": (changed("view", image=255 * PIXELS), "image", "/ 255"),
     "image overshoots": (changed("view", image=1.2 * PIXELS), "image", "np.clip(image, 0, 1)"),
+    "image from -1 to 1": (changed("view", image=2 * PIXELS - 1), "image", "(image + 1) / 2"),
     "image with infinity": (changed("view", image=at_corner(PIXELS, np.inf)), "image", "np.nan_to_num(image"),
     "image of 4 channels": (changed("view", image=np.ones((H, W, 4), np.float32)), "image", "put channels last"),
     "image channels first": (changed("view", image=np.moveaxis(PIXELS, -1, 0)), "image", "put channels last"),

@@ -539,7 +539,7 @@ def read_gaussians(
     path: str | os.PathLike[str],
     normalization: Normalization | None = None,
     *,
-    units: str = "file",
+    units: str | None = None,
     format: str | type[Format] | Format | None = None,
     strict: bool = False,
 ) -> Gaussians:
@@ -552,7 +552,8 @@ def read_gaussians(
     Args:
         path: The file.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
-        units: Units of the result: file as stored, or scene to go with a scene's cameras.
+        units: Units of the result: file as stored, or scene to go with a scene's cameras; None for scene if a normalization is
+            given, else file.
         format: As in `write_gaussians`.
         strict: True to refuse every file with a Gaussian that is not usable.
 
@@ -565,6 +566,7 @@ def read_gaussians(
         warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
     """
+    units = units or ("file" if normalization is None else "scene")
     return read_with_warnings(Path(path), normalization, units, format, strict)
 
 

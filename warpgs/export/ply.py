@@ -303,7 +303,9 @@ def _write(
             file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())
 
 
-def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
+def read_ply(
+    path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str | None = None
+) -> Gaussians:
     """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary or ASCII; `read_gaussians` also reads compressed ones.
 
     Other properties and elements are ignored, but ``filter_3D`` of Mip-Splatting is applied, with a warning. Programs write
@@ -316,7 +318,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     Args:
         path: The file, written by `write_ply` or by another program with the same layout.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
-        units: Units of the result: file as stored, or scene to go with a scene's cameras.
+        units: Units of the result: file as stored, or scene to go with a scene's cameras; None for scene if a normalization is
+            given, else file.
 
     Returns:
         N Gaussians, torch tensors on the CPU, float32, or float64 for map coordinates in file units: means [N, 3], quats wxyz
@@ -327,6 +330,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
             has one that is not usable; the message names the place.
         warpgs.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
+    units = units or ("file" if normalization is None else "scene")
     normalization = geometry.checked_normalization(normalization, units, str(path))
     if is_compressed(start_of(Path(path))):
         raise DataError(f"{path}: is a compressed PLY file, which read_ply does not read; use warpgs.export.read_gaussians")
