@@ -118,6 +118,14 @@ def own_file(tmp_path):
 
 
 @pytest.fixture(autouse=True, scope="session")
+def compiling_is_announced():
+    """Once in a process, after two seconds, a line tells of it: now, or what a test reads would depend on the machine."""
+    from warpgs.kernels import native
+
+    native._say_compiling()
+
+
+@pytest.fixture(autouse=True, scope="session")
 def no_overview_in_reports():
     """Leave the 3D overview out of reports, for speed; tests/report/test_overview.py looks at it."""
     patch = pytest.MonkeyPatch()
